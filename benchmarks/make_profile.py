@@ -7,7 +7,8 @@
 
 A timer of the process's own processor time looks at the main thread every few milliseconds; what was spent since the
 last look, by all threads, counts for what the main thread does. So a compiled function that is called for long counts
-in full, under the line that calls it. Wall times are those of the machine as it is: on a busy one, compare the others.
+in full, under the line that calls it. Wall times are those of the machine as it is: on a busy one, compare the others;
+what of a stage's time the main thread spends itself ("main s") tells how much of it cannot go beside that.
 """
 
 from __future__ import annotations
@@ -73,8 +74,9 @@ class Looks:
         self.lines: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
         self.under: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
         self.wall: dict[str, float] = {}
+        self.main: dict[str, float] = {}
         self.memory: dict[str, float] = {}
-        self._began = time.perf_counter()
+        self._began, self._main = time.perf_counter(), time.thread_time()
 
     def __call__(self, _: int, frame: FrameType | None) -> None:
         """The timer has run out."""
@@ -96,10 +98,11 @@ class Looks:
         """A stage begins."""
         from fluidlift.machine import peak_memory_mb
 
-        now = time.perf_counter()
+        now, main_now = time.perf_counter(), time.thread_time()
         self.wall[self.stage] = now - self._began
+        self.main[self.stage] = main_now - self._main
         self.memory[self.stage] = peak_memory_mb()
-        self.stage, self._began = name, now
+        self.stage, self._began, self._main = name, now, main_now
 
 
 def profiled(clip: str, options: list[str], folder: Path) -> Looks:
@@ -133,16 +136,18 @@ def profiled(clip: str, options: list[str], folder: Path) -> Looks:
 
 def shown(looks: Looks, top: int) -> None:
     """Print it."""
-    print(f"{'stage':12}{'wall s':>8}{'cpu s':>8}{'peak MB':>9}" + "".join(f"{p:>13}" for p in PARTS))
+    print(f"{'stage':12}{'wall s':>8}{'cpu s':>8}{'main s':>8}{'peak MB':>9}" + "".join(f"{p:>13}" for p in PARTS))
     total: dict[str, float] = defaultdict(float)
     for stage, parts in looks.spent.items():
         row = "".join(f"{parts[p]:13.1f}" for p in PARTS)
         cpu = sum(parts.values())
-        print(f"{stage:12}{looks.wall.get(stage, 0):8.1f}{cpu:8.1f}{looks.memory.get(stage, 0):9.0f}{row}")
+        times = f"{looks.wall.get(stage, 0):8.1f}{cpu:8.1f}{looks.main.get(stage, 0):8.1f}"
+        print(f"{stage:12}{times}{looks.memory.get(stage, 0):9.0f}{row}")
         for part, seconds in parts.items():
             total[part] += seconds
     row = "".join(f"{total[p]:13.1f}" for p in PARTS)
-    print(f"{'all':12}{sum(looks.wall.values()):8.1f}{sum(total.values()):8.1f}{max(looks.memory.values()):9.0f}{row}")
+    wall, main_thread, most = sum(looks.wall.values()), sum(looks.main.values()), max(looks.memory.values())
+    print(f"{'all':12}{wall:8.1f}{sum(total.values()):8.1f}{main_thread:8.1f}{most:9.0f}{row}")
     for title, table in (("lines", looks.lines), ("with all they call", looks.under)):
         count = top if title == "lines" else 2 * top
         for stage, lines in table.items() if top else ():

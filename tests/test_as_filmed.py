@@ -7,6 +7,8 @@ import pytest
 from scipy import ndimage
 
 from fluidlift.evaluate.as_filmed import FEWEST, GOOD, USABLE, VERDICTS, WRONG, AsFilmed, Likeness, as_filmed
+from fluidlift.evaluate.film import mean_flow, mean_flows
+from fluidlift.motion.optical_flow import DenseInverseSearch
 
 T, H, W = 48, 64, 96
 INTERVAL = 0.04
@@ -253,3 +255,19 @@ def test_a_level_that_goes_up_and_down_is_held_to_its_mean_after_the_clip():
     waves = np.stack([filling(1, row, row)[0] for row in rows])
     card = as_filmed(clip, waves, INTERVAL, np.concatenate([clip] * 3), np.concatenate([waves] * 3), fills=True)
     assert card.beyond == 2 * T and card.notes == ()
+
+
+def test_each_pair_of_a_clip_is_measured_once_for_all_its_parts(clip, masks, monkeypatch):
+    frames, measured, plain = clip[:24], [], DenseInverseSearch.displacement
+
+    def counted(self, first, second):
+        measured.append(first.tobytes())
+        return plain(self, first, second)
+
+    monkeypatch.setattr(DenseInverseSearch, "displacement", counted)
+    parts = [list(range(16, 23)), list(range(11)), list(range(12, 23)), list(range(7))]
+    flows = mean_flows(frames, masks, parts)
+    assert len(measured) == len(set(measured)) == len({t for part in parts for t in part})
+    for part, flow in zip(parts, flows):
+        alone = mean_flow(frames[part[0] :], masks[part[0] :], [t - part[0] for t in part])
+        np.testing.assert_array_equal(flow, alone)

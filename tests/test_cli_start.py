@@ -37,6 +37,13 @@ def test_help_and_version_load_no_heavy_package():
     assert run.stderr.strip().splitlines()[-1] == "loaded:"
 
 
+def test_torch_is_not_loaded_before_it_is_needed():
+    """Two seconds, for a mask, or for an asset whose body is known already."""
+    code = "import sys, fluidlift.pipeline.make\nassert 'torch' not in sys.modules"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr
+
+
 def test_the_version_is_that_of_the_package():
     run = fluidlift("--version")
     assert (run.returncode, run.stdout.strip()) == (DONE, f"fluidlift {__version__}")

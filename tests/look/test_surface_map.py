@@ -1,5 +1,7 @@
 """The free surface over the plan: height, motion, and what is not part of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -110,3 +112,15 @@ def test_a_picture_is_looked_up_as_scipy_does_it_to_the_last_bit():
         np.testing.assert_allclose(sampled(picture[..., 1].astype(sort), index), wanted[1], rtol=0, atol=last)
     broken = sampled(picture, np.array([[np.nan, 3.0], [2.0, np.inf]]))
     np.testing.assert_array_equal(broken, [picture[0, 3], picture[2, -1]])
+
+
+@pytest.mark.parametrize(
+    ("kind", "channels"), [(np.float64, ()), (np.float64, (2,)), (np.float32, ()), (np.float32, (3,)), (np.int64, ())]
+)
+def test_a_map_is_looked_up_at_places_as_at_their_indices_to_the_last_bit(kind, channels):
+    rng, points = np.random.default_rng(6), pool()
+    surface = replace(SurfaceMap.of(points, 0.0 * points, CELL), pitch=0.037)
+    field = (9.0 * rng.normal(size=(*surface.wet.shape, *channels))).astype(kind)
+    places = rng.uniform(-2.0, 4.0, (500, 3))[:, :2]
+    index = (places - surface.low) / surface.pitch - 0.5
+    np.testing.assert_array_equal(surface.at(field, places), sampled(field, index))

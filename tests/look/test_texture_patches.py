@@ -238,6 +238,14 @@ def test_patches_of_a_film_stay_and_play_as_fast_as_it_was_filmed():
     np.testing.assert_allclose(slow.instants[:n], 4.25, rtol=1e-12)
 
 
+def test_how_the_surface_moves_is_not_asked_for_where_patches_stay(monkeypatch):
+    patches, where = played(0, start=4.0), upright(uniform(0.5))
+    monkeypatch.setattr("fluidlift.look.texture_patches._gradients", lambda *_: pytest.fail("nobody needs it"))
+    for k in range(1, 40):
+        patches.advance(where, STEP, np.random.default_rng(k))
+    assert len(patches.state) and (patches.state.turns == 0).all()
+
+
 @pytest.mark.parametrize("instant", [0, 7, 59])
 def test_one_patch_at_home_shows_the_clips_own_picture(instant):
     patches = played(0)

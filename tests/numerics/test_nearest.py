@@ -43,11 +43,25 @@ def test_points_lie_in_the_order_of_their_cells_and_within_one_in_their_own():
     assert found.starts[0] == 0
 
 
-@pytest.mark.parametrize("points", [1, 5, 40, FEW + 1])
+def test_cells_repeat_in_space_for_points_far_away_and_before_the_first_one():
+    points = np.concatenate([crowd(), [[500.0, -3.0, 40.0], [-7.0, 2.0, 1e4]]]).astype(np.float32)
+    low, width, shape = np.array([0.3, 0.2, 0.4]), 0.1, np.array([7, 5, 9])
+    cells = np.empty(len(points), np.int64)
+    cells_kernel(points, low, width, shape, cells)
+    at = np.floor((points - low) / width).astype(np.int64) % shape
+    np.testing.assert_array_equal(cells, np.ravel_multi_index(tuple(at.T), tuple(shape)))
+
+
+def test_no_places_have_no_neighbours():
+    away, index = nearest_of_crowd(crowd(), crowd()[:0], 3, 0.1)
+    assert away.shape == index.shape == (0, 3) and index.dtype == np.int64
+
+
+@pytest.mark.parametrize("points", [1, 5, 40, FEW + 1, 5000])
 @pytest.mark.parametrize("within", [0.2, np.inf])
 def test_few_points_are_found_as_by_the_tree(points, within):
     rng = np.random.default_rng(points)
-    some, places = rng.uniform(0.0, 1.0, (points, 2)), rng.uniform(-0.2, 1.2, (300, 2))
+    some, places = rng.uniform(0.0, 1.0, (points, 2)), rng.uniform(-0.2, 1.2, (FEW if points == 5000 else 300, 2))
     count = min(4, points)
     away, index = nearest_of_few(some, places, count, within=within)
     wanted, which = nearest(some, places, np.arange(1, count + 1), within=within)

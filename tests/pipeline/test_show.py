@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from fluidlift.config.of_asset import settings_of
 from fluidlift.io.asset_folder import load_asset, read_manifest
@@ -37,3 +38,27 @@ def test_from_the_side_a_stream_ends_where_its_section_is(made, monkeypatch):
     (input_view, side), (input_ragged, side_ragged) = panels(stream), panels(concatenate([stream, drops]))
     np.testing.assert_array_equal(side_ragged, side)
     assert (input_ragged != input_view).any()  # where it is compared with the clip, nothing is left out
+
+
+def test_frames_read_ahead_are_the_same_one_by_one():
+    begun = []
+
+    def frames(broken: int | None = None):
+        for k in range(5):
+            if k == broken:
+                raise OSError("damaged")
+            begun.append(k)
+            yield k, np.zeros(k)
+
+    ahead = show._read_ahead(frames())
+    for k in range(5):
+        number, empty = next(ahead)
+        assert (number, len(empty)) == (k, k)
+        assert len(begun) <= k + 2  # one waits, and no more
+    assert list(ahead) == []
+    found = []
+    with pytest.raises(OSError, match="damaged"):
+        found.extend(number for number, _ in show._read_ahead(frames(broken=3)))
+    ahead = show._read_ahead(frames())
+    next(ahead)
+    ahead.close()  # nobody waits for a film that is no longer wanted

@@ -6,7 +6,7 @@ import pytest
 from fluidlift.scene.simulated_history import _distinct
 
 
-@pytest.mark.parametrize("largest", [5, 2**40])
+@pytest.mark.parametrize("largest", [5, 60, 2**40])  # marked, numbered, sorted by rows
 def test_cells_are_counted_once_each_however_far_apart_they_are(largest):
     rng = np.random.default_rng(0)
     cells = rng.integers(-largest, largest, (3000, 3))

@@ -7,6 +7,7 @@ from scipy import ndimage
 
 from fluidlift.look.rasterize import render
 from fluidlift.shape.generate import (
+    _median_where,
     background_plate,
     beneath_front,
     body_cells,
@@ -396,3 +397,13 @@ def test_colours_stay_within_what_the_picture_shows_around():
     shrill = Gaussians.isotropic(points, 0.01, np.array([[1.0, 0.0, 1.0]]))
     held = bounded_colours(shrill, frame, camera, slack=0.04)
     np.testing.assert_allclose(held.rgb[0], [100 / 255 + 0.04, 100 / 255 - 0.04, 100 / 255 + 0.04], atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 24])
+def test_medians_of_what_counts_are_those_of_masked_arrays(count):
+    rng = np.random.default_rng(count)
+    frames, where = rng.integers(0, 256, (count, 20, 30, 3), np.uint8), rng.random((count, 20, 30)) < 0.5
+    where[:, :3], where[:, 3:6], frames[:, :, :5] = False, True, 255
+    values = np.ma.masked_array(frames, mask=np.repeat(~where[..., None], 3, axis=-1))
+    plain = np.clip(np.ma.median(values, axis=0).filled(0), 0, 255).astype(np.uint8)
+    np.testing.assert_array_equal(_median_where(frames, where), plain)

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from fluidlift.motion.optical_flow import DenseInverseSearch, flow_of_pair
+from fluidlift.motion.optical_flow import DenseInverseSearch, PairsAsTheyAre, flow_of_pair
+from fluidlift.shape.evidence import gather_evidence
 from fluidlift.shape.moving_solids import SharedPairs, _moving_alike, moving_solids
 from fluidlift.types.clip import VideoClip
 
@@ -125,3 +126,53 @@ def test_pairs_that_the_evidence_has_read_are_not_read_again():
     moving_solids(clip, shared, (30, 40))
     assert read == list(range(39))
     assert np.allclose(shared.step(20), 2.0, atol=1e-3)  # float16 of a px or two
+
+
+def test_pairs_read_ahead_are_those_read_one_by_one(monkeypatch):
+    """Side by side, for the evidence that asks for all of them in order; and none is read again after that."""
+    monkeypatch.setattr("fluidlift.motion.multiframe.cores", lambda: 3)
+    rng = np.random.default_rng(8)
+    pictures = np.stack([cv2.GaussianBlur(p, (0, 0), 2.0) for p in rng.uniform(0, 255, (40, 60, 80, 3))])
+    frames, begun = np.clip(6.0 * (pictures - 127.5) + 127.5, 0, 255).astype(np.uint8), []
+    reader = PairsAsTheyAre(frames, DenseInverseSearch())
+
+    class Counted:
+        def __call__(self, t):
+            begun.append(t)
+            return reader(t)
+
+        def in_order(self, pairs):
+            begun.extend(pairs)
+            return reader.in_order(pairs)
+
+    clip = VideoClip(frames, np.arange(40) / 25.0)
+    plain, ahead = SharedPairs(clip, reader), SharedPairs(clip, Counted())
+    asked = list(range(0, 39, 2))
+    found = list(ahead.in_order(asked))
+    assert len(found) == len(asked)
+    for t, (displacement, confidence) in zip(asked, found):
+        np.testing.assert_array_equal(displacement, plain(t)[0])
+        np.testing.assert_array_equal(confidence, plain(t)[1])
+    for t in asked:
+        np.testing.assert_array_equal(ahead.step(t), plain.step(t))
+    assert begun[: len(asked)] == asked
+    assert set(begun[len(asked) :]) <= set(asked) - ahead._wanted  # what is asked for again is kept
+
+
+def test_evidence_reads_flow_ahead_where_the_reader_can():
+    """One pair after the other leaves all other processors idle, for most of the time until there is a mask."""
+    frames = np.zeros((30, 30, 40, 3), np.uint8)
+    frames += np.random.default_rng(0).integers(0, 255, frames.shape, np.uint8)
+    asked: list[list[int]] = []
+
+    class Ahead:
+        def __call__(self, t):
+            raise AssertionError("one by one")
+
+        def in_order(self, pairs):
+            asked.append(list(pairs))
+            return ((np.zeros((30, 40, 2), np.float32), np.ones((30, 40), np.float32)) for _ in asked[-1])
+
+    clip = VideoClip(frames, np.arange(30) / 25.0)
+    gather_evidence(clip, SharedPairs(clip, Ahead()))
+    assert asked == [list(range(29))]

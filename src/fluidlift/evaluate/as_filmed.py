@@ -27,7 +27,8 @@ from fluidlift.evaluate.film import (
     Places,
     film_statistics,
     growth,
-    mean_flow,
+    late_pairs,
+    mean_flows,
     spread,
 )
 from fluidlift.evaluate.images import mask_iou
@@ -214,13 +215,24 @@ def as_filmed(
     after = 0 if moves else _comparable(longer, len(clip), growth(masks) if fills else 0.0)
     later = renders[len(clip) : len(clip) + after] if after >= FEWEST else renders[:0]
 
-    def statistics(frames: np.ndarray, where: np.ndarray, late: float = LATE) -> FilmStatistics:
-        return film_statistics(frames, where, places, foam, interval=interval, late=late)
+    def statistics(
+        frames: np.ndarray, where: np.ndarray, late: float = LATE, flow: np.ndarray | None = None
+    ) -> FilmStatistics:
+        return film_statistics(frames, where, places, foam, interval=interval, late=late, flow=flow)
 
-    whole, within = statistics(clip[:length], masks[:length]), statistics(renders[:length], masks[:length])
+    of_half, behind = late_pairs(half, 0.0), len(clip) - half
+    parts = late_pairs(length), of_half, [behind + t for t in of_half], first_third(length)
+    flows = mean_flows(clip, masks, parts)
+    whole, within = (
+        statistics(clip[:length], masks[:length], flow=flows[0]),
+        statistics(renders[:length], masks[:length]),
+    )
     value = level(masks[:length], coverage[:length], places, seen) | likeness(whole, within, places.fluid, places)
-    first, second = statistics(clip[:half], masks[:half], 0.0), statistics(clip[-half:], masks[-half:], 0.0)
-    floor = likeness(first, second, places.steady, places) | _own_current(clip[:length], masks[:length], whole, places)
+    first, second = (
+        statistics(clip[part], masks[part], 0.0, flow)
+        for part, flow in zip((slice(0, half), slice(behind, None)), flows[1:3])
+    )
+    floor = likeness(first, second, places.steady, places) | _own_current(flows[3], whole, places)
     both = True if seen is None else seen[:half] & seen[-half:]
     floor["level"] = float(mask_iou(masks[:half] & both, masks[-half:] & both).mean())
     if moves:  # its halves differ because it is elsewhere
@@ -337,10 +349,13 @@ def current(a: np.ndarray, b: np.ndarray, inside: np.ndarray) -> tuple[float, fl
     return error, float((one * other).sum()) / length if length > 1e-9 else 0.0
 
 
-def _own_current(clip: np.ndarray, masks: np.ndarray, whole: FilmStatistics, places: Places) -> dict[str, float]:
-    """The floor of the current, which is of the last third alone: that of the first third against it."""
-    third = max(len(clip) - int(LATE * len(clip)), 2)
-    flow = mean_flow(clip[:third], masks[:third], spread(0, third - 1, MOST))
+def first_third(frames: int) -> list[int]:
+    """First frames of the pairs that the floor of the current is taken from."""
+    return spread(0, max(frames - int(LATE * frames), 2) - 1, MOST)
+
+
+def _own_current(flow: np.ndarray, whole: FilmStatistics, places: Places) -> dict[str, float]:
+    """The floor of the current, which is of the last third alone: the mean flow of the first third against it."""
     error, cosine = current(whole.flow, flow, places.steady)
     return {"current_error": error, "current_cosine": cosine}
 

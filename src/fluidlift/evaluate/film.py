@@ -161,6 +161,7 @@ def film_statistics(
     *,
     interval: float,
     late: float = LATE,
+    flow: Float[np.ndarray, "h w 2"] | None = None,
 ) -> FilmStatistics:
     """Statistics of a film.
 
@@ -171,6 +172,7 @@ def film_statistics(
         foam: of the clip.
         interval: s between frames.
         late: share of the frames before those that count for current, bands and colours.
+        flow: its mean flow, where that is known (`mean_flows` of its `late_pairs`); None: it is measured.
     """
     shape = frames.shape[1:3]
     total, weight = np.zeros((*shape, 3), np.float64), np.zeros(shape, np.float64)
@@ -188,25 +190,43 @@ def film_statistics(
         mean, middle = total / weight[..., None], grey / weight
         deviation = np.sqrt(np.maximum(square / weight - middle**2, 0.0))
         share = white / weight
-    first = min(int(late * len(frames)), len(frames) - 2)
-    flow = mean_flow(frames, masks, spread(first, len(frames) - 1, MOST))
-    picks = spread(first, len(frames), MOST)
+    flow = mean_flow(frames, masks, late_pairs(len(frames), late)) if flow is None else flow
+    picks = spread(_first_late(len(frames), late), len(frames), MOST)
     lags = {lag: round(lag / interval) for lag in LAGS}
     along = along_the_flow(frames, masks, np.nan_to_num(middle), flow, lags)
     bands, colours = pyramid_bands(frames, masks, picks), colour_histograms(frames, masks, places.zones, picks)
     return FilmStatistics(mean, deviation, bands, colours, share, flow, along)
 
 
+def late_pairs(frames: int, late: float = LATE) -> list[int]:
+    """First frames of the pairs that the current of a film is taken from."""
+    return spread(_first_late(frames, late), frames - 1, MOST)
+
+
+def _first_late(frames: int, late: float) -> int:
+    return min(int(late * frames), frames - 2)
+
+
 def mean_flow(frames: np.ndarray, masks: np.ndarray, pairs: Sequence[int]) -> Float[np.ndarray, "h w 2"]:
     """Mean displacement from the frames `pairs` to those after them, px/frame, where they show fluid; else NaN."""
-    estimator = DenseInverseSearch()
-    total, weight = np.zeros((*frames.shape[1:3], 2)), np.zeros(frames.shape[1:3])
+    return mean_flows(frames, masks, [pairs])[0]
+
+
+def mean_flows(
+    frames: np.ndarray, masks: np.ndarray, parts: Sequence[Sequence[int]]
+) -> list[Float[np.ndarray, "h w 2"]]:
+    """`mean_flow` of several parts of a film, each pair of which is measured once, in whichever parts it is."""
+    estimator, pairs = DenseInverseSearch(), sorted({t for part in parts for t in part})
+    totals, weights = ([np.zeros((*frames.shape[1:3], *more)) for _ in parts] for more in ((2,), ()))
     calls = ((frames[t], frames[t + 1]) for t in pairs)
     for t, move in zip(pairs, each_pair(estimator.displacement, calls, estimator)):
-        total += move * masks[t][..., None]
-        weight += masks[t]
+        moved = move * masks[t][..., None]
+        for k, part in enumerate(parts):
+            if t in part:
+                totals[k] += moved
+                weights[k] += masks[t]
     with np.errstate(invalid="ignore"):
-        return total / weight[..., None]
+        return [total / weight[..., None] for total, weight in zip(totals, weights)]
 
 
 def pyramid_bands(frames: np.ndarray, masks: np.ndarray, picks: Sequence[int]) -> Float[np.ndarray, " b"]:

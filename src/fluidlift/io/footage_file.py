@@ -15,6 +15,7 @@ from fluidlift.io.limits import ReadLimits, require_file, require_size
 from fluidlift.io.pictures import fitted_size, resample
 from fluidlift.io.video import read_clip
 from fluidlift.messages import code_of
+from fluidlift.numerics.short_axis import least
 
 MOST_FRAMES = 120
 """frames of the clip: four seconds at 30 per second, 0.2 to 1.3 MB at 512 px. Patches of footage last half of it,
@@ -100,7 +101,7 @@ def read_smoke(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarra
             "make the asset again",
         )
     frames = np.asarray(clip.frames)
-    below = frames[:, rows : rows + height, :width].min(axis=-1)
+    below = least(frames[:, rows : rows + height, :width])
     return np.ascontiguousarray(frames[:, :height, :width]), below, float(clip.interval)
 
 

@@ -12,7 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
+from fluidlift.numerics.over_time import sorted_over_time
+from fluidlift.numerics.short_axis import mean_of
 from fluidlift.types import SH_C0, Gaussians, PinholeCamera, sh_from_rgb
+from fluidlift.types.rows import rows
 
 LARGEST_RATIO = 2.0
 """a colour is brightened or darkened by no more than this when it moves to another place"""
@@ -71,7 +74,7 @@ class SteadyShading:
     def at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """The shading where each point is seen; that of the nearest pixel outside the picture."""
         row, col, _ = self.camera.nearest_pixels(points)
-        return self.image[row, col]
+        return rows(self.image.reshape(-1, 3), row * self.image.shape[1] + col)
 
     def moved(self, shown: Gaussians, origin: Float[np.ndarray, "n 3"]) -> Gaussians:
         """Gaussians whose colours were taken at `origin`, shaded for where they are now.
@@ -79,7 +82,7 @@ class SteadyShading:
         What is as colourful as the fluid was there takes the hue of the fluid here; foam is white everywhere.
         """
         here, there = self.at(shown.means), self.at(origin)
-        bright = here.mean(axis=1, keepdims=True) / there.mean(axis=1, keepdims=True)
+        bright = (mean_of(here) / mean_of(there))[:, None]
         tint = np.clip(here / there / bright, 1.0 / LARGEST_TINT, LARGEST_TINT)
         sh = shown.sh.copy()
         color = np.clip(0.5 + SH_C0 * sh[:, 0], 0.0, 1.0)
@@ -100,7 +103,7 @@ def _base(frames: np.ndarray, fluid: np.ndarray, mask: np.ndarray) -> Float[np.n
     pick = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), 24)).astype(int))
     wet = fluid[pick][:, mask]
     # what is no fluid goes to the end of the order
-    order = np.sort(np.where(wet[..., None], frames[pick][:, mask].astype(np.float32), np.inf), axis=0)
+    order = sorted_over_time(np.where(wet[..., None], frames[pick][:, mask].astype(np.float32), np.float32(np.inf)))
     at = np.round(BASE * (np.maximum(wet.sum(axis=0), 1) - 1)).astype(int)
     found = np.take_along_axis(order, at[None, :, None], axis=0)[0]
     out = np.zeros((*mask.shape, 3), np.float32)

@@ -17,6 +17,7 @@ from scipy import ndimage
 from fluidlift.look.footage import AGREE, FluidFootage
 from fluidlift.look.surface_axes import PictureAxes, SurfaceAxes
 from fluidlift.look.surface_map import COLUMN, SurfaceMap, sampled
+from fluidlift.numerics.short_axis import every
 from fluidlift.types import PinholeCamera
 
 FINER = 1.0
@@ -127,7 +128,7 @@ class FilmedOutline:
     def _away(self, world: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """px from the outline (negative within), m of a pixel there, and whether it is in the picture."""
         uv, depth = self._camera.project(world)
-        inside = ((uv >= 0) & (uv <= np.array(self._camera.size))).all(axis=1) & (depth > 0)
+        inside = every((uv >= 0) & (uv <= np.array(self._camera.size))) & (depth > 0)
         return sampled(self._away_px, uv[:, ::-1] - 0.5), depth / self._camera.focal[0], inside
 
 

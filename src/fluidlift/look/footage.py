@@ -140,10 +140,12 @@ class FluidFootage:
         h, w = self.outside.shape
         row, column = (np.clip(along, 0.0, size - 1.0) for along, size in zip(index.T, (h, w)))
         r, c = np.minimum(row.astype(np.int64), h - 2), np.minimum(column.astype(np.int64), w - 2)
-        found = np.zeros(len(index), np.float32)
+        found, corner = np.zeros(len(index), np.float32), r * w + c
+        film, never = self._whole.ravel(), (self.outside > 0).ravel()
         for a, b in np.ndindex(2, 2):
-            weight = np.where(a, row - r, 1.0 - row + r) * np.where(b, column - c, 1.0 - column + c)
-            found += weight * (self._whole[frame, r + a, c + b] | (self.outside[r + a, c + b] > 0))
+            weight = (row - r if a else 1.0 - row + r) * (column - c if b else 1.0 - column + c)
+            at = corner + (a * w + b)
+            found += weight * (film.take(frame * (h * w) + at) | never.take(at))
         return found
 
     def settled(self, frame: int) -> Bool[np.ndarray, "h w"]:

@@ -13,7 +13,9 @@ from jaxtyping import Float
 from fluidlift.errors import require
 from fluidlift.numerics.nearest import nearest_of_crowd
 from fluidlift.numerics.sharing import shared
+from fluidlift.numerics.short_axis import every, most
 from fluidlift.types.gaussians import Gaussians
+from fluidlift.types.rows import rows
 
 RESOLVED = (2.0, 3.0)
 """a splat stretched by the first keeps its colour; by the second, where it is made round, it shows the mean"""
@@ -61,28 +63,28 @@ def mixed(shown: Gaussians, deformation: Float[np.ndarray, "n 3 3"], *, widest: 
     """
     require(len(shown) == len(deformation), f"{len(deformation)} deformations", f"{len(shown)}, one per splat")
     require(widest > 0, f"widest {widest}", "positive metres")
-    sound = np.isfinite(shown.means).all(1)
-    share, size = mixed_share(deformation), shown.scales.max(axis=1, initial=0.0)
+    sound = every(np.isfinite(shown.means))
+    share, size = mixed_share(deformation), most(shown.scales)
     at = np.flatnonzero(sound & ((share > 0) | (size < 0.5 * widest)))
     if len(at) == 0 or sound.sum() <= NEIGHBOURS:
         return shown
     around = np.flatnonzero(sound)
-    points, share, sh, grown = shown.means[around], share[at], shown.sh.copy(), shown.scales.copy()
+    points, share, sh, grown = rows(shown.means, around), share[at], shown.sh.copy(), shown.scales.copy()
     reach = CROWD * widest
     blended, sixth = np.flatnonzero(share > 0), np.empty(len(at))
     if len(blended):
-        distance, near = nearest_of_crowd(points, shown.means[at[blended]], NEIGHBOURS + 1, reach)
+        distance, near = nearest_of_crowd(points, rows(shown.means, at[blended]), NEIGHBOURS + 1, reach)
         one, mean = at[blended], np.empty((len(blended), 3), np.float64)
         _mean_around(distance, around[near], shown.sh[:, 0], mean)
         sh[one, 0] += share[blended, None] * (mean - shown.sh[one, 0])
         sixth[blended] = distance[:, SIXTH - 1]
     kept = np.flatnonzero(share <= 0)
     if len(kept):  # they may grow and keep their colour: one distance is enough
-        sixth[kept] = nearest_of_crowd(points, shown.means[at[kept]], SIXTH, reach)[0][:, -1]
+        sixth[kept] = nearest_of_crowd(points, rows(shown.means, at[kept]), SIXTH, reach)[0][:, -1]
     gap = sixth / np.maximum(size[at], 1e-12)
     alone = np.clip((gap - APART[0]) / (APART[1] - APART[0]), 0.0, 1.0)
     least = np.maximum(share, alone) * np.minimum(0.5 * sixth, widest)
-    grown[at] = np.maximum(shown.scales[at], least[:, None])
+    grown[at] = np.maximum(rows(shown.scales, at), least[:, None])
     return Gaussians(shown.means, shown.quats, grown, shown.opacities, sh)
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fluidlift.numerics.short_axis import every
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3
 
 BESIDE = 0.1
@@ -69,7 +70,7 @@ class PictureAxes:
         """Which points of the map's axes are in the picture, or near it."""
         size = np.array(self.camera.size)
         uv = self.pixels(points)
-        inside = ((uv > -BESIDE * size) & (uv < (1 + BESIDE) * size)).all(axis=1)
+        inside = every((uv > -BESIDE * size) & (uv < (1 + BESIDE) * size))
         return inside & (points[:, 2] < -self._nearest)
 
     def velocities(self, world: Float[np.ndarray, "n 3"], moving: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -11,6 +11,8 @@ from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.numerics.sharing import shared
+from fluidlift.numerics.short_axis import highest, lowest
+from fluidlift.types.rows import rows
 
 COLUMN = 0.5
 """width of a column of the map, cells: each holds particles where there is liquid (eight per cell)"""
@@ -68,23 +70,24 @@ class SurfaceMap:
         require(len(positions) > 0, "no particles", "one or more")
         require(len(positions) == len(velocities), f"{len(velocities)} velocities", f"{len(positions)}")
         pitch, z = COLUMN * cell, np.asarray(positions[:, 2], np.float64)
-        low = positions[:, :2].min(axis=0).astype(np.float64) - (margin + 0.5) * pitch
-        size = np.ceil((positions[:, :2].max(axis=0) - low) / pitch).astype(int) + margin + 1
-        index = np.floor((positions[:, :2] - low) / pitch).astype(int)
-        column = index[:, 0] * size[1] + index[:, 1]
+        low = lowest(positions[:, :2]).astype(np.float64) - (margin + 0.5) * pitch
+        size = np.ceil((highest(positions[:, :2]) - low) / pitch).astype(int) + margin + 1
+        row, along = (np.floor((positions[:, a] - low[a]) / pitch).astype(int) for a in (0, 1))
+        column = row * size[1] + along
         top = np.full(size.prod(), -np.inf)
         np.maximum.at(top, column, z)
         top = top.reshape(size)
         wet, height = _level(top, SPRAY * cell)
-        near = np.abs(z - height.ravel()[column]) < SKIN * cell
-        count = np.bincount(column[near], minlength=size.prod()).reshape(size).astype(np.float64)
-        moved = [np.bincount(column[near], velocities[near, a], minlength=size.prod()).reshape(size) for a in range(3)]
+        near = np.flatnonzero(np.abs(z - height.ravel()[column]) < SKIN * cell)
+        column, moving = column[near], rows(velocities, near)
+        count = np.bincount(column, minlength=size.prod()).reshape(size).astype(np.float64)
+        moved = [np.bincount(column, moving[:, a], minlength=size.prod()).reshape(size) for a in range(3)]
         velocity = np.stack([_mean(m, count, 1.5) for m in moved], axis=-1)
         return cls(low, pitch, wet, height, velocity)
 
     def at(self, field: Shaped[np.ndarray, "nx ny ..."], places: Float[np.ndarray, "n 2"]) -> np.ndarray:
         """A field of the map at some places (x, y in m), between its columns by their distance."""
-        return sampled(field, (np.asarray(places, np.float64) - self.low) / self.pitch - 0.5)
+        return sampled(field, np.asarray(places, np.float64), first=self.low, apart=self.pitch, middle=0.5)
 
     def mean(
         self, values: Float[np.ndarray, " n"], places: Float[np.ndarray, "n 2"], elsewhere: float
@@ -126,23 +129,31 @@ class SurfaceMap:
 
 
 def sampled(
-    field: Float[np.ndarray, "nx ny ..."] | Int[np.ndarray, "nx ny ..."], index: Float[np.ndarray, "n 2"]
+    field: Float[np.ndarray, "nx ny ..."] | Int[np.ndarray, "nx ny ..."],
+    index: Float[np.ndarray, "n 2"],
+    *,
+    first: Float[np.ndarray, "2"] | tuple[float, float] = (0.0, 0.0),
+    apart: float = 1.0,
+    middle: float = 0.0,
 ) -> np.ndarray:
-    """Bilinear, at fractional indices; the nearest value outside."""
+    """Bilinear, at fractional indices, or at places whose index is (place - first) / apart - middle; the nearest value
+    outside."""
     if field.dtype not in (np.float32, np.float64):
-        return ndimage.map_coordinates(field, index.T, order=1, mode="nearest")
+        return ndimage.map_coordinates(field, ((index - first) / apart - middle).T, order=1, mode="nearest")
     channels = field[..., None] if field.ndim == 2 else field
     out = np.empty((len(index), channels.shape[-1]), field.dtype)
-    sampled_kernel(np.ascontiguousarray(channels), np.ascontiguousarray(index, np.float64), out)
+    lattice = np.array([*first, apart, middle], np.float64)
+    sampled_kernel(np.ascontiguousarray(channels), np.ascontiguousarray(index, np.float64), lattice, out)
     return out[:, 0] if field.ndim == 2 else out
 
 
-@shared(lambda field, index, out: (0, len(index)))
-def sampled_kernel(begin, end, field, index, out):
+@shared(lambda field, index, *_: (0, len(index)), error_model="numpy")
+def sampled_kernel(begin, end, field, places, lattice, out):
     """All channels of a picture at once: SciPy finds place and weights again for each. The same bits."""
     height, width, channels = field.shape
+    first_row, first_column, apart, middle = lattice[0], lattice[1], lattice[2], lattice[3]
     for i in range(begin, end):
-        y, x = index[i, 0], index[i, 1]
+        y, x = (places[i, 0] - first_row) / apart - middle, (places[i, 1] - first_column) / apart - middle
         y, x = y if y > 0.0 else 0.0, x if x > 0.0 else 0.0  # so is what is not a number
         y, x = min(y, height - 1.0), min(x, width - 1.0)
         r, c = int(y), int(x)

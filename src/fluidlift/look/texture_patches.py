@@ -14,7 +14,6 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Bool, Float, Num
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
 from fluidlift.look.footage import FluidFootage
@@ -22,6 +21,8 @@ from fluidlift.look.picture_texture import PictureTexture
 from fluidlift.look.seen_texture import SeenTexture
 from fluidlift.look.surface_map import SurfaceMap, sampled
 from fluidlift.numerics.nearest import nearest, nearest_of_few
+from fluidlift.numerics.short_axis import mean_of, most
+from fluidlift.types.rows import rows
 
 APART = 0.6
 """radii between patches: each place is covered by several"""
@@ -172,7 +173,7 @@ class TexturePatches:
         lasting = self.state.centers[~self.state.going]
         uncovered = np.ones(len(bare), bool)
         if len(lasting):
-            uncovered = nearest(lasting, bare)[0] > APART * self._radius
+            uncovered = nearest_of_few(lasting, bare, 1)[0][:, 0] > APART * self._radius
         centers = _spread(bare, uncovered, APART * self._radius, rng)
         if len(centers):
             self.state = self.state.joined(self._fresh(centers, interval == 0, surface, rng))
@@ -199,32 +200,40 @@ class TexturePatches:
             self.state = self.state.joined(self._fresh(np.unique(last, axis=0), False, surface, rng))
 
     def _carry(self, surface: SurfaceMap, interval: float) -> None:
-        s, (flow, spin, shear) = self.state, _gradients(surface, SMOOTH * self._radius)
-        rate = surface.at(shear, s.centers)
-        moved, turns, instants = interval * surface.at(flow, s.centers), s.turns, s.instants
-        if self._stays and self._footage is not None:
-            rate, moved = np.zeros(len(s)), np.zeros((len(s), 2))
+        s = self.state
+        if self._stays and self._footage is not None:  # nothing is carried: how the surface moves need not be known
+            rate, centers, turns = np.zeros(len(s)), s.centers, s.turns
             instants = s.instants + interval / self._footage.interval
-        elif self._footage is not None:
-            there = self._texture.surface.at(self._seen_flow, s.sources)
-            pace = np.linalg.norm(moved, axis=1) / np.maximum(interval * np.linalg.norm(there, axis=1), 1e-9)
-            pace = np.minimum(pace, FASTEST)
-            moved = moved - interval * pace[:, None] * _turned(there, s.turns)
-            instants = s.instants + pace * interval / self._footage.interval
+        else:
+            rate, centers, turns, instants = self._with_the_flow(surface, interval)
         strains = s.strains + interval * rate
         fade = np.clip(LIMIT / 3 / np.maximum(rate * interval, 1e-9), *FADE)
         if self._footage is not None:  # those that go must be gone by the film's last frame
             fade = np.clip(_fade_of(self._footage) / np.maximum(instants - s.instants, 1e-9), 1.0, fade)
         going = (strains > LIMIT) | (instants >= s.ends)
         presences = np.clip(s.presences + np.where(going, -1, 1) / fade, 0.0, 1.0)
-        centers = s.centers + moved
-        if self._footage is None or self._edited:
-            # a line that is carried along turns at most so fast
-            most = interval * (np.abs(surface.at(spin, s.centers)) + rate)
-            turns = turns + np.clip(_wrapped(self._heading(surface, flow, centers, s.sources) - turns), -most, most)
         new = Patches(centers, s.sources, turns, strains, presences, instants, s.ends)
-        away = cKDTree(surface.columns()).query(centers)[0] if surface.wet.any() else np.full(len(s), np.inf)
+        away = nearest_of_few(surface.columns(), centers, 1)[0][:, 0]  # without any, endlessly far
         self.state = new.select(~(new.going & (presences <= 0)) & (away < self._radius))
+
+    def _with_the_flow(
+        self, surface: SurfaceMap, interval: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Shear (1/s), centres (m), turns (radians) and instants (frames) of patches that go with the surface."""
+        s, (flow, spin, shear) = self.state, _gradients(surface, SMOOTH * self._radius)
+        rate = surface.at(shear, s.centers)
+        moved, instants = interval * surface.at(flow, s.centers), s.instants
+        if self._footage is not None:
+            there = self._texture.surface.at(self._seen_flow, s.sources)
+            pace = np.linalg.norm(moved, axis=1) / np.maximum(interval * np.linalg.norm(there, axis=1), 1e-9)
+            pace = np.minimum(pace, FASTEST)
+            moved = moved - interval * pace[:, None] * _turned(there, s.turns)
+            instants = s.instants + pace * interval / self._footage.interval
+        centers = s.centers + moved
+        # a line that is carried along turns at most so fast
+        fastest = interval * (np.abs(surface.at(spin, s.centers)) + rate)
+        turn = _wrapped(self._heading(surface, flow, centers, s.sources) - s.turns)
+        return rate, centers, s.turns + np.clip(turn, -fastest, fastest), instants
 
     def _heading(self, surface: SurfaceMap, flow: np.ndarray, centers: np.ndarray, sources: np.ndarray) -> np.ndarray:
         """Turn (radians) that lies along the flow at `centers` as the look at rest lies along the flow at `sources`.
@@ -254,16 +263,20 @@ class TexturePatches:
     ) -> Patches:
         """New patches that play: their own place, where it was seen and flows as it did; else one that is like it."""
         assert self._footage is not None
-        flow, n = _gradients(surface, SMOOTH * self._radius)[0], len(centers)
-        here, own = surface.at(flow, centers), self._texture.surface.at(self._seen_flow, centers)
-        like = np.linalg.norm(here - own, axis=1) < UNLIKE * np.linalg.norm(own, axis=1)
-        at_home = (self._texture.trust(centers) > 0.5) & (like if self._edited else True)
+        n, at_home, flow = len(centers), self._texture.trust(centers) > 0.5, None
+        if self._edited:
+            flow = _gradients(surface, SMOOTH * self._radius)[0]
+            here, own = surface.at(flow, centers), self._texture.surface.at(self._seen_flow, centers)
+            at_home &= np.linalg.norm(here - own, axis=1) < UNLIKE * np.linalg.norm(own, axis=1)
         if self._together or not self._edited:  # as far as a patch shows anything that was seen
             at_home |= self._seen_within(centers)
         sources = np.array([
             c if home else self._source(c, rng) for c, home in zip(centers, at_home, strict=True)
         ])  # fmt: skip
-        turns = np.where(at_home, 0.0, _wrapped(self._heading(surface, flow, centers, sources)))
+        turns = np.zeros(n)
+        if not at_home.all():
+            flow = _gradients(surface, SMOOTH * self._radius)[0] if flow is None else flow
+            turns = np.where(at_home, 0.0, _wrapped(self._heading(surface, flow, centers, sources)))
         last, fade = len(self._footage) - 1.0, _fade_of(self._footage)
         if self._together:
             lasting = self.state.instants[~self.state.going]
@@ -304,8 +317,8 @@ class TexturePatches:
         s, n = self.state, len(points)
         if n == 0 or len(s) == 0:
             return np.zeros((n, 3)), np.zeros(n, bool), np.ones(n)
-        places, most = np.asarray(points[:, :2], np.float64), min(OVERLAP, len(s))
-        away, patches = nearest_of_few(s.centers, places, most, within=self._radius)
+        places = np.asarray(points[:, :2], np.float64)
+        away, patches = nearest_of_few(s.centers, places, min(OVERLAP, len(s)), within=self._radius)
         point, rank = np.nonzero(np.isfinite(away))
         patch, distance = patches[point, rank], away[point, rank]
         weight = (1 - (distance / self._radius) ** 2) ** (2 * SHARPNESS)
@@ -316,7 +329,7 @@ class TexturePatches:
         np.maximum.at(heaviest, point, weight)
         counts = weight > 1e-3 * heaviest[point]
         point, patch, weight = point[counts], patch[counts], weight[counts]
-        sources = s.sources[patch] + _turned(places[point] - s.centers[patch], -s.turns[patch])
+        sources = rows(s.sources, patch) + _turned(rows(places, point) - rows(s.centers, patch), -s.turns[patch])
         # what was not seen (a rock, a bank) shows only where no other patch is
         weight = weight * np.clip(2 * self._texture.trust(sources) - 0.8, 1e-4, 1.0)
         texture = self._texture
@@ -346,13 +359,13 @@ class TexturePatches:
         n = len(points)
         # at home, a point is looked up where it is seen now, also where the level has changed
         seen, rest = texture.seen_at(points), texture.index_of(points[:, :2])
-        index = texture.index_of(sources) + (seen - rest)[point]
-        home = np.abs(index - seen[point]).max(axis=1, initial=0.0) < SAME
+        index = texture.index_of(sources) + rows(seen - rest, point)
+        home = most(np.abs(index - rows(seen, point))) < SAME
         index, seen = footage.within(index), footage.within(seen)
         mean, residual, wet = footage.looked_up(index, instants, home)
         shade = sampled(footage.shade, seen)
         there = sampled(footage.shade, index)
-        brighter = shade[point].mean(axis=1) / np.maximum(there.mean(axis=1), 1e-3)
+        brighter = mean_of(shade).take(point) / np.maximum(mean_of(there), 1e-3)
         gain = np.clip(brighter, 1 / LARGEST_RATIO, LARGEST_RATIO)
         fine = mean - there
         covers = np.bincount(point, weight * footage.covers(index, instants), minlength=n)

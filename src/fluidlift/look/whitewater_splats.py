@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from fluidlift.errors import require
+from fluidlift.numerics.short_axis import least, most
 from fluidlift.types import Gaussians, sh_from_rgb
 
 SIZES = (0.06, 0.16, 0.08)
@@ -74,8 +75,12 @@ class FilmedFoam:
 
 def foam_pixels(picture: UInt8[np.ndarray, "h w 3"], middle: float) -> Bool[np.ndarray, "h w"]:
     """Which pixels (sRGB) are bright, grey, and brighter than `STANDS_OUT` times `middle` (0 to 255)."""
-    most, least = picture.max(axis=-1).astype(np.float64), picture.min(axis=-1)
-    return (least >= 255 * BRIGHT) & (least >= (1.0 - GREY) * most) & (picture @ _LUMA >= STANDS_OUT * middle)
+    darkest = least(picture)
+    return (
+        (darkest >= 255 * BRIGHT)
+        & (darkest >= (1.0 - GREY) * most(picture).astype(np.float64))
+        & (picture @ _LUMA >= STANDS_OUT * middle)
+    )
 
 
 def whitewater_splats(

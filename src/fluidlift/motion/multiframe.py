@@ -15,7 +15,7 @@ once more over a gap of several frames, without the filter.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeVar
@@ -167,12 +167,16 @@ def flow_of_detail(
         * photometric_agreement(*detail, forward)
         * (texture / (texture + NOISE_GRADIENT**2))
     )
-    return Reading(forward / step, moving_share(detail[0], picture), own * tests**SHARED_FAILURE)
+    return Reading(forward / step, _moving_share(texture, picture), own * tests**SHARED_FAILURE)
 
 
 def moving_share(detail: Float[np.ndarray, "h w"], picture: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
     """0 to 1: texture of what moves against noise and against what trembles, float32."""
-    texture = _texture_in_grey_levels(detail, picture)
+    return _moving_share(_texture_in_grey_levels(detail, picture), picture)
+
+
+def _moving_share(texture: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    """As `moving_share`, of the squared texture of what moves, in grey levels per px."""
     still = (STILL_SHARE * texture_strength(picture)) ** 2
     return _decided(texture / (texture + still + NOISE_GRADIENT**2))
 
@@ -256,13 +260,14 @@ def multiframe_flow(
             progress(t + 1, 2 * pairs)
 
     def with_surroundings() -> Iterator[tuple[np.ndarray, int, np.ndarray, np.ndarray, FlowEstimator]]:
-        earlier: deque[np.ndarray] = deque(maxlen=REACH)
-        for t in range(pairs):
-            own = np.array(displacement[t], np.float32)  # a copy: the array's own is overwritten below
-            window = [*earlier, own, *displacement[t + 1 : t + REACH + 1]]
-            surroundings = _trusted_mean(window, confidence[t - len(earlier) : t + REACH + 1])
-            earlier.append(own)
-            yield frames, t, own, surroundings, estimator
+        window: deque[_Weighed] = deque(maxlen=2 * REACH + 1)  # copies: what the array holds is overwritten below
+        for t in range(-REACH, pairs):
+            if t + REACH < pairs:
+                window.append(_Weighed.of(displacement[t + REACH], confidence[t + REACH]))
+            elif t > REACH:
+                window.popleft()
+            if t >= 0:
+                yield frames, t, window[min(t, REACH)].displacement, _trusted_mean(window), estimator
 
     for t, better in enumerate(each_pair(refined, with_surroundings(), estimator)):
         displacement[t] = better
@@ -374,14 +379,31 @@ def refined(
     return (moving * found + (1.0 - moving) * displacement).astype(np.float32)
 
 
-def _trusted_mean(window: Sequence[np.ndarray], confidence: np.ndarray) -> np.ndarray:
-    """Mean of displacements [n][H,W,2] with the weights of `mean_flow`; without any trust the plain mean."""
-    total, moved = np.zeros(window[0].shape[:2], np.float32), np.zeros_like(window[0])
-    for d, c in zip(window, confidence, strict=True):
-        weight = c.astype(np.float32) ** 2 + NO_TRUST
-        total += weight
-        moved += weight[..., None] * d
-    return moved / total[..., None]
+@dataclass(frozen=True)
+class _Weighed:
+    """The flow of a pair in the mean of its neighbours: worked out once, and asked for by each of them."""
+
+    displacement: Float[np.ndarray, "h w 2"]
+    """px/frame"""
+    weight: Float[np.ndarray, "h w"]
+    """as in `mean_flow`"""
+    moved: Float[np.ndarray, "h w 2"]
+    """displacement times weight"""
+
+    @classmethod
+    def of(cls, displacement: np.ndarray, confidence: np.ndarray) -> _Weighed:
+        """Of a pair; float32."""
+        own, weight = np.array(displacement, np.float32), confidence.astype(np.float32) ** 2 + NO_TRUST
+        return cls(own, weight, weight[..., None] * own)
+
+
+def _trusted_mean(window: Iterable[_Weighed]) -> np.ndarray:
+    """Mean of displacements, float32 [H,W,2]; without any trust the plain mean."""
+    total = moved = np.float32(0)
+    for pair in window:
+        total = total + pair.weight
+        moved = moved + pair.moved
+    return moved / np.asarray(total)[..., None]
 
 
 def mean_flow(

@@ -6,6 +6,7 @@ What several frames say together is in `motion.multiframe`, how far flow is trus
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import cv2
@@ -23,6 +24,7 @@ __all__ = [
     "METHODS",
     "DenseInverseSearch",
     "Farneback",
+    "PairsAsTheyAre",
     "each_pair",
     "estimate_flow",
     "flow_confidence",
@@ -143,6 +145,27 @@ def flow_of_pair(
     """
     forward, backward, own = there_and_back(estimator, first, second)
     return forward, own * flow_confidence(first, forward, backward)
+
+
+class PairsAsTheyAre:
+    """Flow of the pairs of a clip, measured when it is asked for, each by itself (`flow_of_pair`).
+
+    Args:
+        frames: u8 [T,H,W,3]; may be memory-mapped.
+        estimator: of flow between two pictures.
+    """
+
+    def __init__(self, frames: UInt8[np.ndarray, "t h w 3"], estimator: FlowEstimator) -> None:
+        self._frames, self._estimator = frames, estimator
+
+    def __call__(self, t: int) -> tuple[np.ndarray, np.ndarray]:
+        """Displacement [H,W,2], px, and confidence [H,W] from frame t to t + 1."""
+        return flow_of_pair(self._frames[t], self._frames[t + 1], self._estimator)
+
+    def in_order(self, pairs: Iterable[int]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """As a call for each of the pairs, several of them measured side by side (`each_pair`)."""
+        calls = ((self._frames[t], self._frames[t + 1], self._estimator) for t in pairs)
+        return each_pair(flow_of_pair, calls, self._estimator)
 
 
 def flow_picture(

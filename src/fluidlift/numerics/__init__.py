@@ -28,6 +28,8 @@ Modules of the face:
     nearest                 Nearest neighbours: in a k-d tree, or, where points lie about evenly, in the cells
                             around a place
     outline                 Where an outline ends
+    over_time               Orders and medians over the pictures of a film, place by place: what NumPy does one
+                            place at a time
     particle_mean           What particles carry, at other points: means weighted by a kernel (Numba)
     poisson                 The Poisson equation on irregular cell domains (Dirichlet and Neumann): system, plain
                             solvers, the fast one
@@ -37,7 +39,8 @@ Modules of the face:
                             (paper: `percnn_str_fit`)
     sampling                Trilinear interpolation of grid fields at points
     sharing                 How the work of a loop is shared out among threads
-    short_axis              Sums and lengths over a last axis of two or three: colours and vectors of pictures
+    short_axis              Sums, lengths and extremes over a last axis of two or three, and boxes around points:
+                            colours and vectors
     signed_distance         Signed distance fields (SDF) at grid nodes: making them, and keeping points outside the
                             solid
     similarity2             Similarities of the picture plane as matrices [2,3] that act on pixel indices (as
@@ -68,8 +71,8 @@ Modules of the face:
 __all__ = [
     "block_bootstrap", "bspline", "cell_list", "ground_block", "harmonics", "homography2", "isosurface", "lanes",
     "mesh_distance", "mesh_normals", "mirror", "multigrid", "multigrid_assembly", "multigrid_cycle", "nearest",
-    "outline", "particle_mean", "poisson", "recurrent_stencil", "recurrent_stencil_fit", "sampling", "sharing",
-    "short_axis", "signed_distance", "similarity2", "solid_mesh", "splatting", "splatting_colors",
+    "outline", "over_time", "particle_mean", "poisson", "recurrent_stencil", "recurrent_stencil_fit", "sampling",
+    "sharing", "short_axis", "signed_distance", "similarity2", "solid_mesh", "splatting", "splatting_colors",
     "splatting_colors_torch", "splatting_kernels", "splatting_projection", "splatting_torch", "srgb", "symmetric3",
     "textures", "torch_multigrid", "torch_poisson", "triangles",
 ]  # fmt: skip

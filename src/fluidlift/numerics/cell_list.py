@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fluidlift.errors import require
+from fluidlift.numerics.short_axis import highest, lowest
 
 CELLS_PER_POINT = 4
 """at most, of the cells that are kept"""
@@ -38,8 +39,8 @@ class CellList(NamedTuple):
         """
         require(len(points) > 0, "no points", "one or more")
         require(np.isfinite(width) and width > 0, f"cells of {width}", "positive metres")
-        low = points.min(axis=0).astype(np.float64)
-        shape = _cells(points.max(axis=0) - low, width, CELLS_PER_POINT * len(points) + 1000)
+        low = lowest(points).astype(np.float64)
+        shape = _cells(highest(points) - low, width, CELLS_PER_POINT * len(points) + 1000)
         cells = np.empty(len(points), np.int64)
         cells_kernel(points, low, float(width), shape, cells)
         order, starts = np.empty(len(points), np.int64), np.zeros(int(shape.prod()) + 1, np.int64)
@@ -61,7 +62,10 @@ def cells_kernel(points, low, width, shape, cells):
     for p in range(points.shape[0]):
         number = 0
         for axis in range(3):
-            number = number * shape[axis] + np.int64(math.floor((points[p, axis] - low[axis]) / width)) % shape[axis]
+            at = np.int64(math.floor((points[p, axis] - low[axis]) / width))
+            if at < 0 or at >= shape[axis]:  # few are, and a remainder takes as long as all else here
+                at %= shape[axis]
+            number = number * shape[axis] + at
         cells[p] = number
 
 

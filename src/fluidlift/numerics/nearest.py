@@ -19,8 +19,9 @@ MOST_PAIRS = 30_000_000
 """of places that are alone and points, beyond which a tree is faster than cells that come to hold all points"""
 
 FEW = 100
-"""points up to which looking at all of them is faster than a tree: the 8 nearest of 60,000 places in the plane take 18
-ms in a tree and 6 here of 8 points, 35 and 22 of 60, 38 and 33 of 150"""
+"""points, or places, up to which looking at all points is faster than a tree: the 8 nearest of 60,000 places in the
+plane take 18 ms in a tree and 6 here of 8 points, 35 and 22 of 60, 38 and 33 of 150; for few places a tree of many
+points is not built"""
 
 
 def nearest(
@@ -47,7 +48,7 @@ def nearest(
 def nearest_of_few(
     points: Float[np.ndarray, "m d"], places: Float[np.ndarray, "n d"], count: int, *, within: float = np.inf
 ) -> tuple[Float[np.ndarray, "n count"], Int[np.ndarray, "n count"]]:
-    """As `nearest` with an array of 1 to `count`; where points are few (`FEW`), by looking at all of them.
+    """As `nearest` with an array of 1 to `count`; where points or places are few (`FEW`), by looking at all points.
 
     Args:
         points: to search in.
@@ -59,7 +60,7 @@ def nearest_of_few(
         ValueError: no count.
     """
     require(count >= 1, f"{count} neighbours", "one or more")
-    if len(points) > FEW:
+    if min(len(points), len(places)) > FEW:
         return nearest(points, places, np.arange(1, count + 1), within=within)
     distance, index = np.empty((len(places), count)), np.empty((len(places), count), np.int64)
     _few_kernel(
@@ -103,18 +104,20 @@ def nearest_of_crowd(
         ValueError: too few points, or a width that is not positive.
     """
     require(0 < count <= len(points), f"{count} neighbours among {len(points)} points", "at most as many as there are")
-    distance, index = np.empty((len(places), count)), np.empty((len(places), count), np.int64)
-    left = np.arange(len(places))
+    if not len(places):
+        return np.empty((0, count)), np.empty((0, count), np.int64)
+    distance, index = _in_cells(points, np.ascontiguousarray(places), count, width)
+    # what is within a width of a place lies in the 27 cells around it; what is farther may not
+    left = np.flatnonzero(distance[:, -1] > width)
     while len(left):
-        found = _in_cells(points, places[left], count, width)
-        distance[left], index[left] = found
-        # what is within a width of a place lies in the 27 cells around it; what is farther may not
-        left = left[found[0][:, -1] > width]
         width *= WIDER
         if len(left) * len(points) > MOST_PAIRS:
             found = nearest(points, places[left], count, workers=-1)
             distance[left], index[left] = (np.reshape(a, (len(left), count)) for a in found)
             break
+        found = _in_cells(points, places.take(left, axis=0), count, width)
+        distance[left], index[left] = found
+        left = left[found[0][:, -1] > width]
     return distance, index
 
 
@@ -125,7 +128,7 @@ def _in_cells(points: np.ndarray, places: np.ndarray, count: int, width: float) 
     # neighbouring places one after the other: what they look at is in the cache already
     turn = CellList.of(places, width).order
     _nearest_kernel(
-        places, turn, np.ascontiguousarray(points[cells.order]), cells.order, cells.starts, cells.low, cells.width,
+        places, turn, points.take(cells.order, axis=0), cells.order, cells.starts, cells.low, cells.width,
         cells.shape, distance, index,
     )  # fmt: skip
     return distance, index

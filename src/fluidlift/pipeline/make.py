@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import platform
+import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
@@ -108,6 +110,8 @@ def _lifted(
     """From the clip to the parameters; `others` are stretches of a long clip whose motion counts as well."""
     files = given
     read, flow, segmentation = seen = begin.look(runner, given, config, said=hints)
+    if not runner.timings["segment"]["cached"]:  # loaded beside the shape, and needed after it: one to two seconds
+        threading.Thread(target=importlib.import_module, args=("torch",), name="loads torch").start()
     given = _with_bodies(runner, read, segmentation, given, config)
     geometry = begin.shape(runner, seen, given, config, hints)
     settings = taken(RefineSettings, config.shape, seed=config.seed)

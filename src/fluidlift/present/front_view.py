@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fluidlift.numerics.short_axis import every
 from fluidlift.scene.build import Scene
 from fluidlift.scene.footage import Footage
 from fluidlift.types import CellType, Gaussians, PinholeCamera, concatenate, kind_of
+from fluidlift.types.rows import rows
 
 if TYPE_CHECKING:
     from fluidlift.look.outlet_section import OpenEnd
@@ -112,14 +114,14 @@ class FrontView:
         # of smoke most splats are not drawn: what they would show is not worked out
         drawn = gaussians.opacities > ALPHA_MIN
         if not drawn.all():
-            gaussians, velocity = gaussians.select(drawn), velocity[drawn]
+            gaussians, velocity = gaussians.select(drawn), rows(velocity, drawn)
         gaussians, velocity = self._seen(gaussians, velocity)
         shown = concatenate([gaussians, *solids])
         before, z0 = self.camera.project(gaussians.means)
         after, z1 = self.camera.project(gaussians.means + velocity * interval)
-        ahead = (z0 > 0) & (z1 > 0) & np.isfinite(velocity).all(axis=1)
+        ahead = (z0 > 0) & (z1 > 0) & every(np.isfinite(velocity))
         move = np.zeros((len(shown), 2), np.float32)
-        move[: len(gaussians)][ahead] = np.clip((after - before)[ahead], -FARTHEST, FARTHEST)
+        move[: len(gaussians)] = np.where(ahead[:, None], np.clip(after - before, -FARTHEST, FARTHEST), 0.0)
         features = np.concatenate([view_colors(shown, self.camera), move], axis=1)
         behind = np.concatenate([self.plate, np.zeros_like(self.plate[..., :2])], axis=-1)
         picture = render(shown, self.camera, background=behind, features=features)
@@ -132,7 +134,7 @@ class FrontView:
         if self.seen_of is None:
             return gaussians, velocity
         keep = self.seen_of(gaussians)
-        return gaussians.select(keep), velocity[keep]
+        return gaussians.select(keep), rows(velocity, keep)
 
 
 def open_end(scene: Scene) -> OpenEnd | None:

@@ -13,6 +13,7 @@ sampling. What is not known of the water's body and its sky is a range of factor
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 
@@ -119,6 +120,8 @@ class WatchedFlow(SceneWhitewater):
         """
         super().__init__(scene, None)
         self._watch, self._missed = watch, False
+        self._beside = ThreadPoolExecutor(1, "watching")  # nothing that is shown waits for it
+        self._looking: Future[None] | None = None
 
     @classmethod
     def of(cls, scene: Scene) -> WatchedFlow | None:
@@ -131,6 +134,7 @@ class WatchedFlow(SceneWhitewater):
     @property
     def estimates(self) -> dict[str, Estimate]:
         """What was seen; nothing where the simulation went on from a checkpoint, or ended before the flow settled."""
+        self._looked()
         found = None if self._missed else self._watch.found()
         return {} if found is None else found.estimates
 
@@ -140,9 +144,16 @@ class WatchedFlow(SceneWhitewater):
         return ()
 
     def advance(self, particles: Particles, number: int) -> None:
-        """Look at a frame."""
+        """Look at a frame, once the one before has been looked at."""
         if number and not self._missed:
-            self._watch.see(particles)
+            self._looked()
+            self._looking = self._beside.submit(self._watch.see, particles)
+
+    def _looked(self) -> None:
+        """Wait for the frame that is looked at."""
+        looking, self._looking = self._looking, None
+        if looking is not None:
+            looking.result()
 
     def splats(
         self, inside: Callable[[np.ndarray], np.ndarray] | None = None

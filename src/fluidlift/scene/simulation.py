@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.frames import FIRST_FRAME
@@ -13,7 +13,7 @@ from fluidlift.scene.build import Scene, SimulationRequest
 from fluidlift.scene.reshaping import in_words
 from fluidlift.scene.simulated_history import FrameHistory
 from fluidlift.scene.splat_files import checkpoint_file, frame_file, write_frame
-from fluidlift.scene.surface_appearance import SurfaceAppearance
+from fluidlift.scene.surface_appearance import Dressed, SurfaceAppearance
 from fluidlift.source import source_hash
 from fluidlift.types import Particles, kind_of
 
@@ -93,8 +93,7 @@ def advance(
 ) -> str | None:
     """Simulate and write the frames that are missing; why it broke down, if it did.
 
-    While a frame gets its look and is written, another thread simulates the next one; not where a checkpoint is due,
-    which holds the simulator's state.
+    While a frame gets its look, another thread simulates the next one, and a third one writes the frame before.
 
     Args:
         simulator: at the last frame of `history`.
@@ -109,8 +108,10 @@ def advance(
     Raises:
         InputRejected: the disk is full.
     """
+    from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
+
     most = max(max_particles, len(scene.rest) if kind_of(scene.kind).is_gas else 0)  # smoke spreads, a liquid does not
-    with ThreadPoolExecutor(1, "simulation") as beside:
+    with ThreadPoolExecutor(1, "simulation") as beside, Written() as written:
         coming: Future[StepReport] | None = None
         for k in range(len(history), scene.simulated):
             step(k, scene.simulated)
@@ -126,32 +127,57 @@ def advance(
             p, coming = simulator.particles, None
             if k and len(p) > 2 * most:
                 return None
-            history.add(scene, simulator, p, substeps)
             # the first one says whose frames these are
-            due = len(history) % checkpoint_every == 0 or len(history) in (1, scene.simulated)
-            if not due and simulator.any_thread and not scene.obstacles:  # these move on with the simulator
+            due = (k + 1) % checkpoint_every == 0 or k + 1 in (1, scene.simulated)
+            state = simulator.state() if due else {}  # copies
+            ahead = simulator.any_thread and not scene.obstacles  # these move on with the simulator
+            if ahead and k + 1 < scene.simulated:
                 coming = beside.submit(simulator.advance, scene.interval)
-            _write_frame(simulator, appearance, scene, folder, p, k)
+            history.add(scene, simulator, p, substeps)
+            shown = _look(simulator, appearance, scene, p, k)
+            written.begin(write_frame, folder, FIRST_FRAME + k, shown.gaussians, ids=shown.ids,
+                          velocities=shown.velocities)  # fmt: skip
+            if due or not ahead:  # a checkpoint says that its frames are there; what a device holds may change
+                written.wait()
             if due:
-                _save(simulator, appearance, scene, folder, history)
+                kept = Checkpoint(len(history), state_parts(scene), state | appearance.state(), history.arrays())
+                write_checkpoint(checkpoint_file(folder), kept)
     step(scene.simulated, scene.simulated)
     return None
 
 
-def _write_frame(
-    simulator: ParticleSimulator, appearance: SurfaceAppearance, scene: Scene, folder: Path, p: Particles, k: int
-) -> None:
-    """Frame k, whose particles are p; the simulator may be on its way to the next one."""
+class Written:
+    """Writes frames beside other work, one at a time, so that no more than one waits in memory.
+
+    At the end of a `with` block all is written; what went wrong with a frame is raised there, or by the next one.
+    """
+
+    def __init__(self) -> None:
+        self._beside = ThreadPoolExecutor(1, "writing")
+        self._last: Future[Any] | None = None
+
+    def __enter__(self) -> Written:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._beside.shutdown()
+        if kind is None:  # what ended the block is what counts
+            self.wait()
+
+    def begin(self, write: Callable[..., Any], *args: Any, **named: Any) -> None:
+        """Write the next one, with a function that other threads bear, once the one before is written."""
+        self.wait()
+        self._last = self._beside.submit(write, *args, **named)
+
+    def wait(self) -> None:
+        """Until all that was begun is written."""
+        last, self._last = self._last, None
+        if last is not None:
+            last.result()
+
+
+def _look(simulator: ParticleSimulator, appearance: SurfaceAppearance, scene: Scene, p: Particles, k: int) -> Dressed:
+    """The splats of frame k, whose particles are p; the simulator may be on its way to the next one."""
     appearance.advance(p, k)
     inside = simulator.bodies.inside if scene.obstacles else None
-    shown = appearance.dressed(p, k, inside, simulator.deformed)
-    write_frame(folder, FIRST_FRAME + k, shown.gaussians, ids=shown.ids, velocities=shown.velocities)
-
-
-def _save(
-    simulator: ParticleSimulator, appearance: SurfaceAppearance, scene: Scene, folder: Path, history: FrameHistory
-) -> None:
-    from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
-
-    kept = Checkpoint(len(history), state_parts(scene), simulator.state() | appearance.state(), history.arrays())
-    write_checkpoint(checkpoint_file(folder), kept)
+    return appearance.dressed(p, k, inside, simulator.deformed)

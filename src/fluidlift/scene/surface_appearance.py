@@ -19,6 +19,7 @@ from fluidlift.messages import Notice
 from fluidlift.scene.simulator import lends_look
 from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, kind_of, sh_from_rgb
 from fluidlift.types.fluid_masks import STAYS
+from fluidlift.types.rows import rows
 
 if TYPE_CHECKING:
     from fluidlift.look.filmed_outline import FilmedOutline, FilmedOutlines
@@ -314,6 +315,7 @@ class SurfaceAppearance:
         Where the surface is steep (a chute seen from its foot), neighbours on the map are far apart in the picture.
         """
         from fluidlift.look.surface_skin import PITCH, level_for
+        from fluidlift.numerics.short_axis import every, lengths
 
         assert self._surface is not None
         heights, slopes = self._surface.at(self._surface.height, places), self._surface.slope(places)
@@ -321,12 +323,12 @@ class SurfaceAppearance:
         world = self._axes.world_points(points)
         camera = self._camera
         uv, depth = camera.project(world)
-        inside = (depth > 0) & ((uv >= 0) & (uv <= np.array(camera.size))).all(axis=1)
+        inside = (depth > 0) & every((uv >= 0) & (uv <= np.array(camera.size)))
         apart = PITCH * self._cell * camera.focal[0] / np.maximum(depth, 1e-6)
-        steep = np.linalg.norm(slopes, axis=1, keepdims=True)
+        steep = lengths(slopes)[:, None]
         uphill = PITCH * self._cell * np.concatenate([slopes / np.maximum(steep, 1e-9), steep], axis=1)
         beside = camera.project(self._axes.world_points(points + uphill))[0]
-        apart = np.maximum(apart, np.linalg.norm(beside - uv, axis=1))
+        apart = np.maximum(apart, lengths(beside - uv))
         return np.where(inside, level_for(apart, FINE), 0)
 
     def _seen_texture(self, surface: SurfaceMap, footage: FluidFootage | None) -> SeenTexture:
@@ -434,11 +436,13 @@ class SurfaceAppearance:
 
     def _shaded(self, shown: Gaussians, source: np.ndarray) -> Gaussians:
         """The splats with the shade of the places where they are now; those with a colour of their own keep it."""
+        from fluidlift.numerics.short_axis import every
+
         scene = self._scene
         if scene.shading is None:
             return shown
-        painted = (scene.rest.means if scene.painted is None else scene.painted)[source]
-        own = ~np.all(np.isfinite(painted), axis=1)
+        painted = rows(scene.rest.means if scene.painted is None else scene.painted, source)
+        own = ~every(np.isfinite(painted))
         moved = scene.shading.moved(shown, np.where(own[:, None], shown.means, painted))
         return moved if not own.any() else replace(moved, sh=np.where(own[:, None, None], shown.sh, moved.sh))
 
@@ -477,7 +481,7 @@ class SurfaceAppearance:
         # what is in the air before a surface shows the film where it is seen, as on a map over the picture it always is
         deepest = np.inf if self._outline is not None or isinstance(axes, PictureAxes) else TINTED
         near = np.flatnonzero((above > -TINTED) & (above < deepest) & (covered < 1) & ~own)
-        color, there, _ = patches.colors(places[near])
+        color, there, _ = patches.colors(rows(places, near))
         sh[near[there], :1] = sh_from_rgb(color[there])
         points = skin.points(surface)
         color, there, covers = patches.colors(points)
@@ -502,8 +506,10 @@ class SurfaceAppearance:
 
     def _own_colors(self, source: np.ndarray) -> np.ndarray:
         """Which particles bring a colour of their own, as dye does."""
+        from fluidlift.numerics.short_axis import every
+
         painted = self._scene.painted
-        return np.zeros(len(source), bool) if painted is None else ~np.all(np.isfinite(painted[source]), axis=1)
+        return np.zeros(len(source), bool) if painted is None else ~every(np.isfinite(rows(painted, source)))
 
     def _clearance(self, points: np.ndarray) -> np.ndarray:
         """How far points are from the ground, m; negative inside it."""

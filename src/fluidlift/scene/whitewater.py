@@ -12,6 +12,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -253,8 +255,16 @@ def filmed_foam(scene: Scene) -> FilmedFoam | None:
     """The foam of a scene's film; None where it has none that can be read (which is said elsewhere)."""
     if scene.film is None or not scene.film.is_file():
         return None
+    written = scene.film.stat()
+    return _foam_in(scene.film, scene.camera.size, (written.st_mtime_ns, written.st_size))
+
+
+@lru_cache(maxsize=1)
+def _foam_in(film: Path, size: tuple[int, int], written: tuple[int, int]) -> FilmedFoam | None:
+    """As `filmed_foam`, of a file as it was `written`. The last one is kept: it is asked for before a simulation and
+    after it, and takes a second or two."""
     try:
-        frames, fluid, _ = read_footage(scene.film, scene.camera.size)
+        frames, fluid, _ = read_footage(film, size)
     except InputRejected:
         return None
     return FilmedFoam.of(frames, fluid)

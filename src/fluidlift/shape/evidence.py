@@ -7,7 +7,7 @@ slightest tremble of the camera or of the codec changes the brightness.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -32,6 +32,12 @@ PairReader = Callable[[int], tuple[np.ndarray, np.ndarray]]
 def pair_reader(flow: PixelFlow | PairReader) -> PairReader:
     """What reads the flow of a pair, of either form."""
     return flow if callable(flow) else (lambda t: (flow.displacement[t], flow.confidence[t]))
+
+
+def in_order(flow: PairReader, pairs: Iterable[int]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """The flow of some pairs, one after the other; a reader with a method of this name measures several at a time."""
+    ahead = getattr(flow, "in_order", None)
+    return map(flow, pairs) if ahead is None else ahead(pairs)
 
 
 QUANTISATION = 0.3
@@ -195,8 +201,8 @@ def flow_evidence(
     before, after = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
     total, squares = np.zeros((height, width, 2), np.float32), np.zeros((height, width), np.float32)
     pairs = source.pairs(1)
-    for one, other in pairs:
-        displacement, confidence = flow(int(source.sampled[one]))
+    flows = in_order(flow, [int(source.sampled[one]) for one, _ in pairs])
+    for (one, other), (displacement, confidence) in zip(pairs, flows, strict=True):
         sure = shrink(np.asarray(confidence, np.float32), scale)[..., None]
         step = shrink(np.nan_to_num(np.asarray(displacement, np.float32)), scale) * scale
         first, second = source.kept[one].astype(np.float32), source.kept[other].astype(np.float32)

@@ -7,6 +7,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from fluidlift.numerics.over_time import median_over_time
+
 MOST_SAMPLED = 150
 """frames whose pictures are kept: the spread of an average over them is below a tenth of that of one frame"""
 BURST_SECONDS = 1.0
@@ -38,15 +40,23 @@ def shrink(picture: np.ndarray, scale: float) -> np.ndarray:
     """The picture at working size (area mean)."""
     if scale == 1.0:
         return picture
-    height, width = picture.shape[:2]
-    size = (max(round(width * scale), 8), max(round(height * scale), 8))
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    height, width = _shrunk(picture.shape[0], picture.shape[1], scale)
+    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def working_size(height: int, width: int) -> tuple[int, int]:
+    """Height and width of pictures at working size, px."""
+    return _shrunk(height, width, working_scale(height, width))
+
+
+def _shrunk(height: int, width: int, scale: float) -> tuple[int, int]:
+    return (height, width) if scale == 1.0 else (max(round(height * scale), 8), max(round(width * scale), 8))
 
 
 def typical_picture(pictures: np.ndarray, *, most: int = 31) -> np.ndarray:
     """Temporal median, float32 [h,w,3], of at most `most` evenly spaced pictures."""
     pick = np.unique(np.linspace(0, len(pictures) - 1, min(most, len(pictures))).round().astype(int))
-    return np.median(pictures[pick].astype(np.float32), axis=0)
+    return median_over_time(pictures[pick].astype(np.float32))
 
 
 def burst_length(frames: int, interval: float, *, most: int = MOST_SAMPLED) -> int:

@@ -11,6 +11,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from fluidlift.errors import require
+from fluidlift.numerics.over_time import median_over_time, sorted_over_time
 from fluidlift.shape.background import weight_of_unseen
 from fluidlift.types import SH_C0, CellType, Gaussians, PinholeCamera, Setting, decompose_covariances, sh_from_rgb
 from fluidlift.types.fluid_masks import FluidMasks
@@ -47,6 +48,18 @@ class BackgroundPlate:
     """True where the picture is the clip's: what is seen, and the rim of wide fluid"""
 
 
+def _median_where(frames: UInt8[np.ndarray, "t h w 3"], where: Bool[np.ndarray, "t h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Median of the frames that count at each pixel, rounded down; 0 where none does."""
+    count = where.sum(axis=0)
+    # the others go to the end of the order
+    order = sorted_over_time(np.where(where[..., None], frames, np.uint8(255)))
+    low, high = (
+        np.take_along_axis(order, np.maximum(at, 0)[None, ..., None], axis=0)[0].astype(np.uint16)
+        for at in ((count - 1) // 2, np.minimum(count // 2, len(frames) - 1))
+    )
+    return np.where(count[..., None] > 0, (low + high) // 2, 0).astype(np.uint8)
+
+
 def background_plate(
     frames: UInt8[np.ndarray, "t h w 3"],
     fluid: Bool[np.ndarray, "t h w"] | FluidMasks,
@@ -70,11 +83,10 @@ def background_plate(
     if solid is not None:
         wet &= ~solid
     seen = ~np.all(wet, axis=0)
-    median = np.median(frames[pick], axis=0).astype(np.uint8)
+    median = median_over_time(frames[pick]).astype(np.uint8)
     if not seen.any():
         return BackgroundPlate(median, seen, seen)
-    values = np.ma.masked_array(frames[pick], mask=np.repeat(wet[..., None], 3, axis=-1))
-    image = np.clip(np.ma.median(values, axis=0).filled(0), 0, 255).astype(np.uint8)
+    image = _median_where(frames[pick], ~wet)
     beside = np.zeros_like(seen) if solid is None else ndimage.binary_dilation(solid, iterations=3)
     if shore:
         seen = _without_missed(seen, wet.mean(axis=0), image, median, beside)

@@ -9,7 +9,7 @@ its leading or trailing end keeps up with its motion, where a current flows thro
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -17,7 +17,7 @@ import numpy as np
 
 from fluidlift.numerics.short_axis import lengths, summed
 from fluidlift.numerics.similarity2 import composed, inverse
-from fluidlift.shape.evidence import PairReader
+from fluidlift.shape.evidence import PairReader, in_order
 from fluidlift.shape.frame_pictures import shrink, working_scale
 from fluidlift.types.clip import VideoClip
 
@@ -92,10 +92,19 @@ class SharedPairs:
 
     def __call__(self, t: int) -> tuple[np.ndarray, np.ndarray]:
         """Displacement [H,W,2], px, and confidence [H,W] from frame t to t + 1."""
-        displacement, confidence = self._flow(t)
+        return self._noted(t, self._flow(t))
+
+    def in_order(self, pairs: Iterable[int]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """As a call for each of the pairs; its flow may be read ahead."""
+        asked = list(pairs)
+        for t, found in zip(asked, in_order(self._flow, asked), strict=True):
+            yield self._noted(t, found)
+
+    def _noted(self, t: int, found: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """The flow of a pair as it was read, kept where it will be asked for."""
         if t in self._wanted and t not in self._kept:
-            self._kept[t] = self._shrunk(displacement).astype(np.float16)
-        return displacement, confidence
+            self._kept[t] = self._shrunk(found[0]).astype(np.float16)
+        return found
 
     def step(self, t: int) -> np.ndarray:
         """float32 [h,w,2]: displacement from frame t to t + 1 at the size at which solids are looked for, px of it."""

@@ -26,6 +26,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from fluidlift.errors import require
+from fluidlift.numerics.over_time import median_over_time
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.types.fluid_masks import FluidMasks
 
@@ -119,7 +120,7 @@ def still_layer(
     pick = np.unique(np.linspace(0, len(frames) - 1, most).round().astype(int))
     light = linear_from_srgb(np.arange(256, dtype=np.float32) / 255.0).astype(np.float32)
     pictures = np.stack([light[frames[t]] for t in pick])
-    usual = np.median(pictures, axis=0)
+    usual = median_over_time(pictures)
     stays, beds = _compared(pictures, usual, inner, _ways(flow, trust * inner), upright)
     window, whole = 2.0 * np.pi * (AROUND * max(inner.shape)) ** 2, int((often >= ALWAYS).sum())
     seen = _large(beds & inner, max(window, LEAST * whole))
@@ -164,7 +165,7 @@ def _halves(pictures: np.ndarray, ways: np.ndarray, band: tuple[float, float]) -
     along = np.stack([_along(p, ways, band) for p in pictures])
     half = len(along) // 2
     energy = (along.sum(axis=-1) ** 2).mean(axis=0)
-    return np.median(along[:half], axis=0), np.median(along[-half:], axis=0), energy
+    return median_over_time(along[:half]), median_over_time(along[-half:]), energy
 
 
 def _compared(
@@ -214,7 +215,7 @@ def _coherence(pictures: np.ndarray, finest: float, upright: np.ndarray, around:
     """
     half, slopes = len(pictures) // 2, []
     for part in (pictures[:half], pictures[-half:]):
-        still = np.median(part, axis=0).sum(axis=-1)
+        still = median_over_time(part).sum(axis=-1)
         down, right = np.gradient(cv2.GaussianBlur(still, (0, 0), finest) - cv2.GaussianBlur(still, (0, 0), 4 * finest))
         slopes.append((right, down * upright))
     (right, down), (other_right, other_down) = slopes

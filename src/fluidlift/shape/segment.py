@@ -12,6 +12,7 @@ are read one by one and may lie in a file, and labels may be written to arrays o
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,6 +25,7 @@ from fluidlift.shape.background import in_own_colours
 from fluidlift.shape.carried_layers import by_either, carried_layers
 from fluidlift.shape.colour_growth import grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence, pair_reader, solids_by_flow
+from fluidlift.shape.frame_pictures import working_size
 from fluidlift.shape.hints import VOICE, Clicks, Point, clicks_at, heed, holes_asked_for
 from fluidlift.shape.intermittently_wet import WashedGround, bare_over_time, washed_ground
 from fluidlift.shape.mirrored_edges import mirrored_edges
@@ -172,15 +174,16 @@ def clues_of(
     `said` are log odds of fluid from elsewhere, float32 [h,w] of the whole picture at any size.
     """
     pairs = SharedPairs(clip, pair_reader(flow))
-    evidence = gather_evidence(clip, pairs)
-    mirrored = mirrored_edges(clip.frames)
+    small = working_size(*clip.frames.shape[1:3])
+    with ThreadPoolExecutor(1, "layers") as beside:  # neither asks for the flow, which takes most of the time
+        edges, carried = beside.submit(mirrored_edges, clip.frames), beside.submit(carried_layers, clip, small)
+        evidence = gather_evidence(clip, pairs)
+    mirrored, layers = edges.result(), carried.result()
     inside = region_of_interest(roi, *clip.frames.shape[1:3]) & ~mirrored
     inside = shrink_mask(inside, evidence.noise.shape)
     if said is not None:
         said = cv2.resize(said, evidence.noise.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    size = evidence.noise.shape
-    layers = carried_layers(clip, size)
-    solids = by_either(layers, moving_solids(clip, pairs, size))
+    solids = by_either(layers, moving_solids(clip, pairs, evidence.noise.shape))
     horizon = sea_horizon(evidence, layers)
     if horizon is not None:
         evidence, solids = evidence.without_carried(), reaching_over(solids, horizon)

@@ -17,6 +17,8 @@ Modules of the face:
     parameter_table  Table of the physical parameters: what scene.yaml, the fit and the viewer know of each, in one
                      place
     quantity         Quantities as people write them, "3 s", "10 cm", "2 cSt", in SI units
+    rows             Some rows of an array of vectors: NumPy gathers short rows one number at a time, and `take` a
+                     row at a time
     stages           What the stages leave: one frozen value per stage, which checks itself
     terrain          The solid world that a fluid runs over
     transforms       Rigid motions, similarities and quaternions
@@ -91,6 +93,7 @@ __all__ = [
     "parameter_table",
     "quantity",
     "quat_from_matrix",
+    "rows",
     "sh_from_rgb",
     "stages",
     "terrain",

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from fluidlift.errors import require
 from fluidlift.types import harmonics
+from fluidlift.types.rows import rows
 from fluidlift.types.transforms import Similarity3, matrix_from_quat, quat_from_matrix
 
 SH_C0 = 0.28209479177387814
@@ -83,9 +84,9 @@ class Gaussians:
 
     def select(self, index: np.ndarray | slice) -> Gaussians:
         """Those of a boolean or integer index, or of a slice."""
-        return Gaussians(
-            self.means[index], self.quats[index], self.scales[index], self.opacities[index], self.sh[index]
-        )
+        if not isinstance(index, slice) and np.asarray(index).dtype == bool and len(index) == len(self):
+            index = np.flatnonzero(index)  # once for all
+        return Gaussians(*(rows(a, index) for a in (self.means, self.quats, self.scales, self.opacities, self.sh)))
 
     def transformed(self, target_from_source: Similarity3) -> Gaussians:
         """Moved, turned and scaled as one body: it looks the same from a camera that was moved with it."""
@@ -109,7 +110,7 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
     parts = [p for p in parts if len(p)] or list(parts[:1])
     require(len(parts) > 0, "nothing to concatenate")
     k = max(p.sh.shape[1] for p in parts)
-    sh = [np.pad(p.sh, ((0, 0), (0, k - p.sh.shape[1]), (0, 0))) for p in parts]
+    sh = [p.sh if p.sh.shape[1] == k else np.pad(p.sh, ((0, 0), (0, k - p.sh.shape[1]), (0, 0))) for p in parts]
     return Gaussians(
         np.concatenate([p.means for p in parts]),
         np.concatenate([p.quats for p in parts]),

@@ -97,8 +97,9 @@ class Grid:
 
     def contains(self, points: Float[np.ndarray, "*n 3"], margin: float = 0.0) -> np.ndarray:
         """bool [*n]: inside the box, at least `margin` metres from its sides."""
-        p = np.asarray(points)
-        return np.all((p >= self.low + margin) & (p < self.high - margin), axis=-1)
+        p, low, high = np.asarray(points), self.low + margin, self.high - margin
+        x, y, z = ((p[..., a] >= low[a]) & (p[..., a] < high[a]) for a in range(3))  # all of an axis of three are slow
+        return x & y & z
 
 
 @dataclass(frozen=True)

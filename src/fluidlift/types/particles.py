@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fluidlift.errors import require
+from fluidlift.types.rows import rows
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,8 @@ class Particles:
     def select(self, index: np.ndarray) -> Particles:
         """Those of a boolean or integer index."""
         return Particles(
-            self.positions[index], self.velocities[index], self.affine[index], self.deformation[index],
-            self.masses[index], self.source[index], self.ids[index],
+            rows(self.positions, index), rows(self.velocities, index), rows(self.affine, index),
+            rows(self.deformation, index), rows(self.masses, index), rows(self.source, index), rows(self.ids, index),
         )  # fmt: skip
 
     def joined(self, other: Particles) -> Particles:

@@ -70,7 +70,8 @@ class RigidTransform:
 
     def points(self, x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Positions, metres."""
-        return x @ self.rotation.T + self.translation
+        # of mixed types a product takes five times as long
+        return np.asarray(x, np.float64) @ self.rotation.T + self.translation
 
     def vectors(self, v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Directions and velocities: rotated, not moved."""

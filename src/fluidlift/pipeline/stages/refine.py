@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fluidlift.backends.gsplat_rasterizer import best_rasterizer
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline.given_body import placed_bodies
 from fluidlift.pipeline.inputs import GivenFile
@@ -165,6 +164,7 @@ def _bodies(
     seen: _Seen, given: GivenFile | None
 ) -> tuple[list[Gaussians], _Refinement, tuple[tuple[float, float], ...]]:
     """One body per united frame, each refined against its picture; those after the first start from the last."""
+    from fluidlift.backends.gsplat_rasterizer import best_rasterizer
     from fluidlift.shape.prune import prune
 
     g, pictures, fluid = seen.geometry, seen.frames, seen.fluid

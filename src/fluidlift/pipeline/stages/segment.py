@@ -109,12 +109,9 @@ def _require_hints(config: SegmentSettings, hints: MaskHints) -> None:
 
 def _flow_for_masks(clip: VideoClip, flow: Flow) -> PixelFlow | PairReader:
     """Flow of single pairs as they are, where ours is blind to what stands still: to a mask, rest is a finding."""
-    from fluidlift.motion.optical_flow import DenseInverseSearch, flow_of_pair
+    from fluidlift.motion.optical_flow import DenseInverseSearch, PairsAsTheyAre
 
-    if flow.method != "multiframe":
-        return flow.flow
-    frames, estimator = clip.frames, DenseInverseSearch()
-    return lambda t: flow_of_pair(frames[t], frames[t + 1], estimator)
+    return flow.flow if flow.method != "multiframe" else PairsAsTheyAre(clip.frames, DenseInverseSearch())
 
 
 def _learned(clip: VideoClip, config: SegmentSettings, hints: MaskHints, work: Work) -> Segmenter:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from fluidlift.scene.splat_files import splat_frames
 from fluidlift.types import PinholeCamera, kind_of
 from fluidlift.types.stages import Shown, Simulation
 
+T = TypeVar("T")
 COVERS, COVERS_THIN = 0.5, 0.15
 """opacity from which a pixel counts as covered by a liquid, and by smoke whose film cannot be asked for it"""
 
@@ -136,7 +137,7 @@ def _panels(
 ) -> Iterator[np.ndarray]:
     """Input | re-simulation | side view, frame by frame; keeps what the evaluation needs on the way.
 
-    The side view is drawn by another thread, where splats are shown as they are.
+    The side view is drawn by another thread, where splats are shown as they are, and the next frame is read by one.
     """
     from fluidlift.look.pictures import caption
 
@@ -150,7 +151,7 @@ def _panels(
     size = _panel_size(scene.camera.size, config.width)
     side = _side_camera(scene, renderer, size)
     with ThreadPoolExecutor(1, "side view") as beside:
-        for k, (gaussians, _, speeds) in enumerate(splat_frames(folder, len(poses))):
+        for k, (gaussians, _, speeds) in enumerate(_read_ahead(splat_frames(folder, len(poses)))):
             step(k, len(poses))
             frame = SimulatedFrame(gaussians, speeds, poses[k])
             # another look keeps pictures of its own between two views
@@ -169,6 +170,15 @@ def _panels(
             if footage is not None:
                 panels.insert(0, caption(*_input(footage, round(k * scene.interval / scene.clip_interval), size)))
             yield np.concatenate(panels, axis=1)
+
+
+def _read_ahead(frames: Iterator[T]) -> Iterator[T]:
+    """The same, each read by another thread while the one before is drawn."""
+    with ThreadPoolExecutor(1, "reading") as beside:
+        coming = beside.submit(next, frames, None)
+        while (frame := coming.result()) is not None:
+            coming = beside.submit(next, frames, None)
+            yield frame
 
 
 def _covers(scene: Scene, footage: Footage | None) -> float:

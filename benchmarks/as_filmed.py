@@ -31,6 +31,7 @@ import cv2
 import numpy as np
 from report import table
 
+from fluidlift.errors import InputRejected
 from fluidlift.evaluate.as_filmed import AsFilmed, Likeness
 from fluidlift.io.asset_folder import read_manifest
 from fluidlift.io.video import probe
@@ -103,7 +104,10 @@ class Way:
         except SystemExit as failure:
             return name, {"none": str(failure)}
         took = time.monotonic() - began
-        found = card_against(folder, clip, start=after) if self.held_out else card_of(read_manifest(folder))
+        try:
+            found = card_against(folder, clip, start=after) if self.held_out else card_of(read_manifest(folder))
+        except InputRejected as refused:  # a third of a clip of ten frames
+            found = str(refused)
         plain = {"none": found} if isinstance(found, str) else found.to_dict()
         plain |= {"took": round(took, 1), "kind": read_manifest(folder).get("kind")}
         picture(folder / "preview.mp4", kept.with_suffix(".jpg"), 1.0 / LENGTH)

@@ -1,6 +1,6 @@
 """What a person's hints change: drafts of clips alone and with a hints file, and how right each is.
 
-    python benchmarks/hinted.py --hints hints --work runs/hinted [--labels folder] [--only name] [--find] [--record]
+    python benchmarks/hinted.py --hints hints --work runs/hinted [--only name] [--find] [--record]
 
 `--hints` is a folder of <clip>.yaml (docs/hints.md), written by a person who looked at the clip for a minute. Clips are
 looked for below FLUIDLIFT_SHARED, or a folder `shared` beside the repository. Each is made twice, at 320 px, from 1.2 s
@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from as_filmed import fluidlift
 from clips import default_shared
-from masks import UNJUDGED, _carried
+from masks import UNJUDGED, _carried, drawn_mask
 
 from fluidlift.config import build_config
 from fluidlift.evaluate.as_filmed import WRONG
@@ -51,8 +51,8 @@ class Subject:
     name: str
     video: Path
     hints: Path
-    drawn: Path | None
-    """mask of its middle frame"""
+    drawn: np.ndarray | None
+    """mask of its middle frame, as of `drawn_mask`"""
 
     @property
     def middle(self) -> float:
@@ -66,16 +66,14 @@ class Subject:
         return round(max(self.middle - 0.5 * SECONDS, 0.0), 2)
 
 
-def subjects(hints: Path, shared: Path, labels: Path | None) -> list[Subject]:
+def subjects(hints: Path, shared: Path) -> list[Subject]:
     """Those with a hints file, in order."""
     found = []
     for file in sorted(hints.glob("*.yaml")):
         video = next((p for p in shared.glob(f"clips*/{file.stem}/video.mp4")), None)
         if video is None:
             raise SystemExit(f"no clip '{file.stem}' below {shared}")
-        options = [] if labels is None else [labels / f"{file.stem}.png"]
-        options += [video.parent / "mask.png", video.parent / "mask_hand.png"]
-        found.append(Subject(file.stem, video, file, next((p for p in options if p.is_file()), None)))
+        found.append(Subject(file.stem, video, file, drawn_mask(video.parent)))
     return found
 
 
@@ -147,9 +145,7 @@ def overlap(s: Subject, seen: Seen) -> float | None:
     clip = seen.read.clip
     raw = read_clip(s.video, start=max(s.middle - 1e-3, 0.0), duration=0.2, max_size=SIZE).frames[0]
     t = frame_at(clip.times, s.middle)
-    drawn = cv2.imread(str(s.drawn), cv2.IMREAD_GRAYSCALE)
-    assert drawn is not None, s.drawn
-    drawn = cv2.resize(drawn, raw.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    drawn = cv2.resize(s.drawn, raw.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     motion = _carried(raw, seen.frames[t]) if seen.read.stabilised else np.eye(2, 3)
     truth = cv2.warpAffine(
         drawn, motion, clip.size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=UNJUDGED
@@ -195,7 +191,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--hints", type=Path, required=True, help="folder of <clip>.yaml")
     parser.add_argument("--work", type=Path, default=Path("runs/hinted"), help="folder for what is made")
-    parser.add_argument("--labels", type=Path, help="folder of masks drawn by hand, which win over those of the clips")
     parser.add_argument("--only", nargs="+", help="names of clips")
     parser.add_argument("--ways", nargs="+", default=WAYS, choices=WAYS, help="alone, hinted or both")
     parser.add_argument("--find", action="store_true", help="mask, kind and tilt only")
@@ -205,7 +200,7 @@ def main() -> int:
     if shared is None:
         raise SystemExit("no clips: set FLUIDLIFT_SHARED")
     rows: dict[str, dict[str, dict[str, Any]]] = {}
-    for s in subjects(wanted.hints, shared, wanted.labels):
+    for s in subjects(wanted.hints, shared):
         if wanted.only and s.name not in wanted.only:
             continue
         rows[s.name] = {way: figures(s, wanted.work, way, find=wanted.find) for way in wanted.ways}

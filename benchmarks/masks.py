@@ -1,17 +1,19 @@
 """Overlap of the automatic mask with masks that a person drew and with exact ones; puts it into benchmarks/results.
 
-    python benchmarks/masks.py --work runs/masks [--labels folder] && python -m benchmarks.report
+    python benchmarks/masks.py --work runs/masks && python -m benchmarks.report
 
 Clips (folders with video.mp4) and cases (with truth.npz) are looked for below FLUIDLIFT_SHARED, or a folder `shared`
 beside the repository; the demo is always there. A mask drawn by hand belongs to the middle frame: mask.png beside the
-clip, or <clip>.png in `--labels` (255 fluid, 128 not judged), which wins. It is carried to the steadied picture by the
-features that both have. Exact masks count at every frame. Frames and optical flow are kept in the work folder: they do
-not depend on how a mask is found. `--overlays` writes pictures: the mask that was found, and the right outline.
+clip, or outlines of mask_outlines.json (percent of width and height: fluid, then what in it is dry, then what a person
+could not tell; to about 8 px of 512). It is carried to the steadied picture by the features that both have. Exact masks
+count at every frame. Frames and optical flow are kept in the work folder: they do not depend on how a mask is found.
+`--overlays` writes pictures: the mask that was found, and the right outline.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import platform
 import shutil
 import time
@@ -42,6 +44,7 @@ from fluidlift.shape.segment import clues_of, overlay, segment
 from fluidlift.synthetic.demo import unpack_demo_case
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
 
+OUTLINES = Path(__file__).with_name("mask_outlines.json")
 UNFIT = ("cascade", "dyntex_fountain", "waterfall")
 """clips whose mask_hand.png covers other water than the clip shows"""
 READING = ReadSettings(
@@ -67,8 +70,8 @@ class Subject:
 
     name: str
     video: Path
-    drawn: Path | None = None
-    """mask of the middle frame"""
+    drawn: np.ndarray | None = None
+    """u8 [H,W], mask of the middle frame, of any size: 255 fluid, 0 none, `UNJUDGED`"""
     case: Path | None = None
     """folder with the truth of every frame"""
 
@@ -92,7 +95,7 @@ class Prepared:
         return self.displacement[t].astype(np.float32), self.confidence[t].astype(np.float32)
 
 
-def subjects(shared: Path | None, work: Path, labels: Path | None = None) -> Iterator[Subject]:
+def subjects(shared: Path | None, work: Path) -> Iterator[Subject]:
     """The demo, then cases, then clips for which there is a mask."""
     demo = unpack_demo_case(work / "demo_case")
     yield Subject("demo", demo / "video.mp4", case=demo)
@@ -102,12 +105,26 @@ def subjects(shared: Path | None, work: Path, labels: Path | None = None) -> Ite
         for video in sorted(folder.glob("video*.mp4")):
             yield Subject(folder.name + video.stem.removeprefix("video"), video, case=folder)
     for video in sorted([*shared.glob("clips/*/video.mp4"), *shared.glob("clips2/*/video.mp4")]):
-        name = video.parent.name
-        options = [video.parent / "mask.png", *([] if name in UNFIT else [video.parent / "mask_hand.png"])]
-        options = ([labels / f"{name}.png"] if labels is not None else []) + options
-        drawn = next((path for path in options if path.is_file()), None)
-        if drawn is not None:
-            yield Subject(f"clip {name}", video, drawn)
+        if (drawn := drawn_mask(video.parent)) is not None:
+            yield Subject(f"clip {video.parent.name}", video, drawn)
+
+
+def drawn_mask(clip: Path) -> np.ndarray | None:
+    """u8 [H,W], the mask of the middle frame of a clip in a folder of its own, where a person drew one."""
+    for path in (clip / "mask.png", *([] if clip.name in UNFIT else [clip / "mask_hand.png"])):
+        if path.is_file():
+            return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    outlines = json.loads(OUTLINES.read_text(encoding="utf-8"))
+    return filled(outlines[clip.name]) if clip.name in outlines else None
+
+
+def filled(outlines: dict[str, list[list[list[float]]]], size: int = 1024) -> np.ndarray:
+    """u8 [size,size], the mask that polygons bound, which are in percent of width and height."""
+    mask = np.zeros((size, size), np.uint8)
+    for what, value in (("fluid", 255), ("dry", 0), ("unjudged", UNJUDGED)):
+        for polygon in outlines.get(what, []):
+            cv2.fillPoly(mask, [np.rint(np.array(polygon) * (size / 100.0)).astype(np.int32)], value)
+    return mask
 
 
 def prepared(subject: Subject, work: Path) -> Prepared:
@@ -150,8 +167,7 @@ def _truth(subject: Subject, clip: VideoClip, kept: np.ndarray, middle: np.ndarr
         masks = [resample_nearest(masks[k], (width, height)) for k in kept if k < len(masks)]
         return {t: np.where(mask, np.uint8(255), np.uint8(0)) for t, mask in enumerate(masks)}
     assert subject.drawn is not None, "a clip without a case has a drawn mask"
-    drawn = cv2.imread(str(subject.drawn), cv2.IMREAD_GRAYSCALE)
-    drawn = cv2.resize(drawn, middle.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    drawn = cv2.resize(subject.drawn, middle.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     alike = [float(np.abs(clip.frames[t][::4, ::4].astype(int) - middle[::4, ::4]).mean()) for t in range(len(clip))]
     near = int(np.abs(kept - _middle_number(subject, kept)).argmin()) if min(alike) > 1.0 else int(np.argmin(alike))
     motion = _carried(middle, np.asarray(clip.frames[near]))
@@ -263,7 +279,6 @@ def main() -> None:
     """Measure what was asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, required=True, help="folder for frames and flow")
-    parser.add_argument("--labels", type=Path, help="folder with more drawn masks")
     parser.add_argument("--only", nargs="*", help="names of subjects")
     parser.add_argument("--overlays", type=Path, help="folder for pictures")
     parser.add_argument("--pixels", type=Path, help="file for a sample of pixels, which masks_fit.py reads")
@@ -272,7 +287,7 @@ def main() -> None:
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
     records, sure, ious, pixels, water = [], [], [], {}, {}
-    for subject in subjects(default_shared(), args.work, args.labels):
+    for subject in subjects(default_shared(), args.work):
         if args.only and subject.name.removeprefix("clip ") not in args.only:
             continue
         ready = prepared(subject, args.work)

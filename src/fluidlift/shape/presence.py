@@ -70,6 +70,11 @@ def always(presence: Presence) -> Presence:
     return replace(presence, first=first, last=np.full_like(first, presence.frames - 1))
 
 
+def remaining(presence: Presence) -> Presence:
+    """The same clip with nothing that leaves: what was poured lies still where it lies, as long as the jet runs."""
+    return replace(presence, last=np.where(presence.ever, presence.frames - 1, presence.last))
+
+
 def stay(presence: Presence) -> tuple[np.ndarray, np.ndarray]:
     """First and last frame of a fluid that has its place, int [h,w], smoothed; near the ends of the clip means from
     or to the end."""

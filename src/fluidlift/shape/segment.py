@@ -33,9 +33,10 @@ from fluidlift.shape.moving_front import advancing_labels
 from fluidlift.shape.moving_solids import SharedPairs, moving_solids
 from fluidlift.shape.open_sea import reaching_over, sea_horizon, with_sea
 from fluidlift.shape.open_water import with_open_water
-from fluidlift.shape.presence import Presence, always, grows, stay, watch
+from fluidlift.shape.presence import Presence, always, grows, remaining, stay, watch
 from fluidlift.shape.region import clean_region, cut_along_edges, solids_in, still_pixels
 from fluidlift.shape.still_regions import without_ground
+from fluidlift.shape.swaying_jets import SwayingJets, swaying_jets, uncovered_over_time
 from fluidlift.shape.thin_outlines import slimmed
 from fluidlift.shape.vegetation import without_plants
 from fluidlift.shape.view import OpenHorizon
@@ -96,6 +97,8 @@ class Bed:
     """what stands in it"""
     washed: WashedGround | None = None
     """ground that it runs over now and then"""
+    jets: SwayingJets | None = None
+    """what of it sways"""
 
 
 @dataclass(frozen=True)
@@ -146,6 +149,16 @@ class Clues:
         return grown_from_streams(self.evidence, self.inside)
 
     @cached_property
+    def advances(self) -> bool:
+        """Whether it comes into the picture, or leaves it, instead of staying in its bed.
+
+        What a jet sways over is seen active in the course of the clip, too, and is there from first to last.
+        """
+        if self.grown is not None or self.horizon is not None:
+            return False
+        return grows(self.presence, self.score > 2.0) and self.bed.jets is None
+
+    @cached_property
     def bed(self) -> Bed:
         """Where it is, if it stays in its bed."""
         evidence, score = self.evidence, self.score
@@ -158,6 +171,8 @@ class Clues:
             # nothing passes on a sea: what goes nowhere, or looks the same between two waves, is no rock for that
             found = with_sea(evidence, region, self.solids | ~self.inside, self.horizon)
             return Bed(found, np.zeros_like(found))
+        if (jets := swaying_jets(evidence, region)) is not None:  # what they pour lies still, and is no ground
+            return Bed(region, np.zeros_like(region), jets=jets)
         washed = washed_ground(evidence, region)
         region, rocks = without_ground(evidence, region)
         taken = first & ~region  # plants and washed ground wander, too, and were told from water already
@@ -239,8 +254,8 @@ def segment(
         raise InputRejected("nothing moves in this clip", "a fluid that moves before a camera that stands still",
                             "give a --mask")  # fmt: skip
     tell(0.3, "presence")
-    presence, grown = known.presence, known.grown
-    if grown is None and known.horizon is None and grows(presence, score > 2.0):
+    presence = known.presence
+    if known.advances:
         told = heed(clicks, evidence, score, score > 0.0)[1] if clicks else np.zeros_like(score)
         # a jet that sways with its jug changes as its flow says too: where all clues together speak for fluid, it is
         carried = solids_by_flow(evidence) & (score <= 0.0)
@@ -278,6 +293,8 @@ def staying_labels(known: Clues, clicks: Clicks) -> Iterator[tuple[np.ndarray, n
     still = still_pixels(evidence)
     if grown is not None:  # change says nothing in such a clip: neither when the fluid came nor what is a rock
         presence, still = always(presence), np.zeros_like(still)
+    elif known.bed.jets is not None:  # a heap lies still where it has been poured: it neither leaves nor is a rock
+        presence, still = remaining(presence), np.zeros_like(still)
     still = still | asked | rocks
     found = lasting_labels(known.told, region, still, presence)
     if grown is None:
@@ -285,6 +302,8 @@ def staying_labels(known: Clues, clicks: Clicks) -> Iterator[tuple[np.ndarray, n
         dry = dry_over_time(evidence, outline, solid, presence.picked)
         if washed is not None:
             dry = (ashore | bare for ashore, bare in zip(dry, bare_over_time(evidence, washed), strict=True))
+        if (jets := known.bed.jets) is not None:
+            dry = (bare | free for bare, free in zip(dry, uncovered_over_time(evidence, jets), strict=True))
         found = given_back(found, (bare & ~held for bare in dry))
     return found
 

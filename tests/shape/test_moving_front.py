@@ -17,7 +17,7 @@ from fluidlift.shape.background import (
     steady_fluid,
     without_background,
 )
-from fluidlift.shape.moving_front import median_over_time
+from fluidlift.shape.moving_front import median_of_three
 from fluidlift.shape.segment import segment
 from fluidlift.types.clip import VideoClip
 
@@ -25,10 +25,10 @@ from fluidlift.types.clip import VideoClip
 def test_the_median_over_time_drops_a_single_frame():
     odds = np.zeros((5, 2, 2), np.float32)
     odds[2] = 9.0
-    smooth = list(median_over_time(iter(odds)))
+    smooth = list(median_of_three(iter(odds)))
     assert len(smooth) == 5 and not np.any(smooth)
     for frames in (1, 2):
-        assert np.array_equal(list(median_over_time(iter(odds[:frames]))), odds[:frames])
+        assert np.array_equal(list(median_of_three(iter(odds[:frames]))), odds[:frames])
 
 
 def test_background_that_shows_between_the_fluid_is_taken_out_of_its_colours():

@@ -31,7 +31,7 @@ def each_its_own_way(t: int) -> np.ndarray:
     return 4.0 * rows[t] / rows.std()
 
 
-def not_at_all(t: int) -> np.ndarray:  # noqa: ARG001
+def not_at_all(t: int) -> np.ndarray:
     return np.zeros(HEIGHT)
 
 

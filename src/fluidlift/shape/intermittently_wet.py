@@ -19,7 +19,7 @@ from fluidlift.shape.background import colour_bins, colour_histogram
 from fluidlift.shape.colour_growth import DECISIVE, RARE, STIFFNESS
 from fluidlift.shape.evidence import Evidence
 from fluidlift.shape.min_cut import disc, edge_weights, min_cut, spread
-from fluidlift.shape.moving_front import median_over_time
+from fluidlift.shape.moving_front import median_of_three
 from fluidlift.shape.region import SMALLEST_SOLID
 from fluidlift.shape.still_regions import FLOWS, LARGEST, STOPPED, SURE
 from fluidlift.shape.waterline import BINS
@@ -127,5 +127,5 @@ def bare_over_time(evidence: Evidence, ground: WashedGround) -> Iterator[np.ndar
     limit = BARE * ground.still
     frames = (evidence.source[t].astype(np.float32) for t in range(len(evidence.source)))
     apart = (np.minimum(np.abs(frame - ground.picture).sum(axis=-1) / limit, 3.0) for frame in frames)
-    for ratio in median_over_time(apart):
+    for ratio in median_of_three(apart):
         yield ground.where & (cv2.GaussianBlur(ratio, (0, 0), BLUR) < 1.0)

@@ -50,7 +50,7 @@ def advancing_labels(
     domain = spread(clean_region(sure_of > -1.0), 0.01 * max(score.shape))
     domain &= hint > -2.0
     still = still_pixels(evidence)
-    for odds in median_over_time(odds_over_time(evidence, presence, domain, hint)):
+    for odds in median_of_three(odds_over_time(evidence, presence, domain, hint)):
         region, solid = solids_in(clean_region(odds > 0.0, gap=GAP), still)
         labels = np.zeros(score.shape, np.uint8)
         labels[region], labels[solid] = Label.FLUID, Label.SOLID
@@ -93,7 +93,7 @@ def odds_over_time(
         yield np.clip(np.where(domain, best, -12.0), -12.0, 12.0).astype(np.float32)
 
 
-def median_over_time(odds: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+def median_of_three(odds: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
     """Median of three neighbouring frames, ends kept; only three are held at a time."""
     before = next(odds, None)
     if before is None:

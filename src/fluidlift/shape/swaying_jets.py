@@ -19,7 +19,7 @@ from fluidlift.shape.background import filled_in
 from fluidlift.shape.evidence import Evidence, distance_of_pictures
 from fluidlift.shape.intermittently_wet import most_often
 from fluidlift.shape.min_cut import disc, spread
-from fluidlift.shape.moving_front import median_over_time
+from fluidlift.shape.moving_front import median_of_three
 
 WIDEST = 0.05
 """part of the longer side: a jet and its sway are no wider (radius)"""
@@ -101,7 +101,7 @@ def covered_over_time(
         cv2.GaussianBlur(np.where(jets.thin, distance_of_pictures(p, jets.behind), np.float32(0.0)), (0, 0), BLUR)
         for p in pictures
     )
-    for apart in median_over_time(differences):
+    for apart in median_of_three(differences):
         middle = np.where(jets.thin, cv2.GaussianBlur(apart, (0, 0), AROUND), np.float32(0.0))
         middle = cv2.GaussianBlur(cv2.dilate(middle, disc(RIDGE * longest)), (0, 0), RIDGE * longest)
         found = jets.where & (apart > np.maximum(jets.still, HALF * middle))

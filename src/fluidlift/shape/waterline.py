@@ -15,7 +15,7 @@ from scipy.ndimage import convolve1d
 from fluidlift.shape.background import colour_bins
 from fluidlift.shape.evidence import POOLING, Evidence
 from fluidlift.shape.min_cut import disc, spread
-from fluidlift.shape.moving_front import median_over_time
+from fluidlift.shape.moving_front import median_of_three
 
 REACH = 0.04
 """part of the longer side: how far a waterline may go back, and the width of the strip of ground that is looked at"""
@@ -111,7 +111,7 @@ def dry_over_time(
         yield from (np.zeros_like(region) for _ in range(len(evidence.source)))
         return
     frames = (evidence.source[t].astype(np.float32) for t in range(len(evidence.source)))
-    for odds in median_over_time(colours(picture) for picture in frames):
+    for odds in median_of_three(colours(picture) for picture in frames):
         dry = shore & (odds < 0.0)
         parts = cv2.connectedComponents((dry | outside).astype(np.uint8), connectivity=4)[1]
         dry &= np.isin(parts, np.unique(parts[outside]))

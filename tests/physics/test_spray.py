@@ -57,6 +57,29 @@ def test_a_pool_that_is_thrown_up_keeps_its_volume():
     assert kept.particles.positions[:, 2].max() > 0.5  # and it flies
 
 
+def test_drops_that_rise_and_fall_through_the_same_cells_do_not_brake_each_other():
+    x, z = np.meshgrid((np.arange(16) + 0.5) * 0.05, (np.arange(4) + 0.5) * 0.05 + 0.6, indexing="ij")
+    places = np.stack([x.ravel() - 0.4, np.zeros(x.size), z.ravel()], -1).astype(np.float32)
+    speed = np.where(np.arange(len(places)) % 2 == 0, 2.0, -1.0).astype(np.float32)  # beside each other, m/s
+
+    def after(airy_above: float | None) -> np.ndarray:
+        start = Particles.at_rest(places, 1.0)
+        start.velocities[:, 2] = speed
+        terrain = Terrain(GRID, np.ones(GRID.nodes().shape[:3], np.float32), np.array([0.0, 0.0, 1.0]), NO_MESH)
+        simulator = LiquidSimulator(
+            GRID, terrain, FluidParameters(time_step=0.01), start, cell_types=np.zeros(GRID.shape, np.uint8),
+            settings=SimulationSettings(airy_above=airy_above, airy=SHARE, reseed=False),
+        )  # fmt: skip
+        for _ in range(5):
+            simulator.advance(0.02)
+        held = simulator.particles
+        return held.positions[np.argsort(held.ids), 2]
+
+    fall = places[:, 2] + speed * 0.1 - 0.5 * 9.81 * 0.1**2
+    assert np.abs(after(0.0) - fall).max() < 0.01  # m: of first order in steps of 0.01 s
+    assert np.abs(after(None) - fall).mean() > 0.05  # through the grid they move together
+
+
 def test_cells_to_draw_from_are_some_of_the_grid():
     with pytest.raises(ValueError, match="some of"):
         fountain(keeps=False).keep_volume(np.zeros(GRID.shape, bool))

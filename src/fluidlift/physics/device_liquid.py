@@ -49,5 +49,6 @@ def left_to_the_host(surroundings: Surroundings, forces: Sequence[BodyForce], bo
         "surface tension": parameters.surface_tension > 0,
         "a force of its own kind": not all(isinstance(f, (SteadyForce, Nudging, Guiding)) for f in forces),
         "a prescribed outflow": surroundings.settings.prescribe_outflow,
+        "drops that fly": surroundings.settings.airy_above is not None,
     }
     return ", ".join(reason for reason, true in reasons.items() if true)

@@ -41,7 +41,8 @@ class SimulationSettings:
     """m/s: discharge of the inlet over its section, where that is less than the speed at which it flows in. The liquid
     is then a share of what is seen of it, this over the speed (continuity); None: all of it"""
     airy_above: float | None = None
-    """m: z above which what is there at the start is spray, and so is what flows in; None: nothing is"""
+    """m: z above which what is there at the start is spray, and so is what flows in, and flies as stones do; None:
+    nothing is and does"""
     airy: float = 1.0
     """share of spray that is liquid"""
     prescribe_outflow: bool = False

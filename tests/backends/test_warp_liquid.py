@@ -226,6 +226,7 @@ def test_the_host_keeps_what_the_device_cannot_do():
         "surface tension": tense.simulator(work=work),
         "a force of its own kind": tank.simulator(work=work, forces=[Whim()]),
         "a prescribed outflow": tank.simulator(work=work, settings=SimulationSettings(prescribe_outflow=True)),
+        "drops that fly": tank.simulator(work=work, settings=SimulationSettings(airy_above=0.5)),
         "rigid bodies": tanks.pool(cells=12).with_bodies(ball).simulator(work=work),
     }
     for reason, simulator in reasons.items():

@@ -97,8 +97,6 @@ class Bed:
     """what stands in it"""
     washed: WashedGround | None = None
     """ground that it runs over now and then"""
-    jets: SwayingJets | None = None
-    """what of it sways"""
 
 
 @dataclass(frozen=True)
@@ -156,26 +154,42 @@ class Clues:
         """
         if self.grown is not None or self.horizon is not None:
             return False
-        return grows(self.presence, self.score > 2.0) and self.bed.jets is None
+        return grows(self.presence, self.score > 2.0) and self.jets is None
+
+    @cached_property
+    def _first(self) -> np.ndarray:
+        """bool [h,w], the outline of what stays, plants and washed ground with it."""
+        return lasting_region(self.evidence, self.score, self.inside)
+
+    @cached_property
+    def _without_plants(self) -> np.ndarray:
+        """bool [h,w], the same without plants, and with thin parts as thin as they are."""
+        return without_plants(self.evidence, self.score, slimmed(self.evidence, self._first), self.interval)
+
+    @cached_property
+    def jets(self) -> SwayingJets | None:
+        """What sways as jets do; None without any, and where change or a horizon tells otherwise."""
+        if self.grown is not None or self.horizon is not None:
+            return None
+        return swaying_jets(self.evidence, self._without_plants)
 
     @cached_property
     def bed(self) -> Bed:
         """Where it is, if it stays in its bed."""
-        evidence, score = self.evidence, self.score
+        evidence = self.evidence
         if self.grown is not None:
             region = with_open_water(evidence, clean_region(self.grown), self.solids | ~self.inside)
             return Bed(region, np.zeros_like(region))
-        first = lasting_region(evidence, score, self.inside)
-        region = without_plants(evidence, score, slimmed(evidence, first), self.interval)
+        region = self._without_plants
         if self.horizon is not None:
             # nothing passes on a sea: what goes nowhere, or looks the same between two waves, is no rock for that
             found = with_sea(evidence, region, self.solids | ~self.inside, self.horizon)
             return Bed(found, np.zeros_like(found))
-        if (jets := swaying_jets(evidence, region)) is not None:  # what they pour lies still, and is no ground
-            return Bed(region, np.zeros_like(region), jets=jets)
+        if self.jets is not None:  # what they pour lies still, and is no ground
+            return Bed(region, np.zeros_like(region))
         washed = washed_ground(evidence, region)
         region, rocks = without_ground(evidence, region)
-        taken = first & ~region  # plants and washed ground wander, too, and were told from water already
+        taken = self._first & ~region  # plants and washed ground wander, too, and were told from water already
         region = with_open_water(evidence, region, rocks | self.solids | taken | ~self.inside)
         return Bed(region, rocks, washed)
 
@@ -293,7 +307,7 @@ def staying_labels(known: Clues, clicks: Clicks) -> Iterator[tuple[np.ndarray, n
     still = still_pixels(evidence)
     if grown is not None:  # change says nothing in such a clip: neither when the fluid came nor what is a rock
         presence, still = always(presence), np.zeros_like(still)
-    elif known.bed.jets is not None:  # a heap lies still where it has been poured: it neither leaves nor is a rock
+    elif known.jets is not None:  # a heap lies still where it has been poured: it neither leaves nor is a rock
         presence, still = remaining(presence), np.zeros_like(still)
     still = still | asked | rocks
     found = lasting_labels(known.told, region, still, presence)
@@ -302,8 +316,8 @@ def staying_labels(known: Clues, clicks: Clicks) -> Iterator[tuple[np.ndarray, n
         dry = dry_over_time(evidence, outline, solid, presence.picked)
         if washed is not None:
             dry = (ashore | bare for ashore, bare in zip(dry, bare_over_time(evidence, washed), strict=True))
-        if (jets := known.bed.jets) is not None:
-            dry = (bare | free for bare, free in zip(dry, uncovered_over_time(evidence, jets), strict=True))
+        if known.jets is not None:
+            dry = (bare | free for bare, free in zip(dry, uncovered_over_time(evidence, known.jets), strict=True))
         found = given_back(found, (bare & ~held for bare in dry))
     return found
 

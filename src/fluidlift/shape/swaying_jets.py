@@ -44,8 +44,8 @@ GAP = 0.012
 APART = 0.03
 """part of the longer side between two rows that are compared"""
 TOGETHER = 0.7
-"""correlation of their sway from which they go together: jets of three real pours have 0.87 to 0.90, 24 other thin
-pieces of masks (edges of falls, pools, brooks, lava, a jug) -0.09 to 0.44"""
+"""correlation of their sway from which they go together: jets of three real pours have 0.87 to 0.90, 27 other thin
+pieces of masks (edges of falls, pools, brooks, lava, a jug) -0.09 to 0.44, or are too short to tell"""
 ALWAYS = 0.8
 """share of the frames in which a row must show the jet, to be compared"""
 

@@ -17,9 +17,9 @@ from fluidlift.shape.background import (
     steady_fluid,
     without_background,
 )
-from fluidlift.shape.moving_front import median_of_three
+from fluidlift.shape.moving_front import median_of_three, without_strays
 from fluidlift.shape.segment import segment
-from fluidlift.types.clip import VideoClip
+from fluidlift.types.clip import Label, VideoClip
 
 
 def test_the_median_over_time_drops_a_single_frame():
@@ -179,3 +179,37 @@ def test_what_came_over_a_place_and_lies_still_is_no_background_of_it_and_shade_
     assert np.allclose(found[:3, :2], ground) and np.allclose(found[3], ground)
     assert np.allclose(found[:3, 2:4], 0.5 * (ground + shade)) and np.allclose(found[:3, 4:], ground)
     assert (count[:, :2] == 10.0).all() and (count[:3, 2:] == 20.0).all()
+
+
+def moving_discs(*ways, frames=20, size=(60, 80)):
+    """u8 [T,H,W]: discs of 1, each a radius and its place (u, v) per frame, None where it is not there."""
+    v, u = np.mgrid[: size[0], : size[1]]
+    labels = np.zeros((frames, *size), np.uint8)
+    for radius, place in ways:
+        for t in range(frames):
+            if (at := place(t)) is not None:
+                labels[t][np.hypot(u - at[0], v - at[1]) < radius] = Label.FLUID
+    return labels
+
+
+@pytest.mark.parametrize(
+    ("place", "stays"),
+    [
+        (lambda t: (65, 15) if t < 6 else None, False),  # a light on the rim of a jug
+        (lambda t: (30 + 2 * t, 40) if t < 9 else None, True),  # a drop that has come off it
+        (lambda t: (65 - 2 * (t - 8), 40) if 8 <= t < 18 else None, True),  # one that comes to it
+        (lambda t: (65, 15), True),  # a second jet, from first to last
+    ],
+)
+def test_what_hangs_together_with_nothing_and_does_not_last_is_no_part_of_one_fluid(place, stays):
+    main = (14.0, lambda t: (22, 40))
+    labels, alone = moving_discs(main, (4.0, place)), moving_discs(main)
+    before = labels.copy()
+    cleared = without_strays(labels)
+    assert np.array_equal(labels, before if stays else alone)
+    assert cleared == (before != labels).sum() and (cleared > 0) != stays
+
+
+def test_of_two_that_are_alike_neither_is_a_stray_and_nothing_has_none():
+    labels = moving_discs((10.0, lambda t: (15, 15) if t < 8 else None), (10.0, lambda t: (60, 40) if t > 12 else None))
+    assert without_strays(labels) == 0 and without_strays(np.zeros((3, 8, 8), np.uint8)) == 0

@@ -22,7 +22,7 @@ ROCK, ROCK_RADIUS = (0.35, 0.05), 0.18
 
 def channel(mainstream=(1.0, 0.0, 0.0), *, slope=0.0, rock=True, along="x", tail=False, **options):
     """Water 1.2 m wide between straight banks, seen at 45 degrees from beside it; a rock stands in it."""
-    camera = PinholeCamera.looking((0.0, -3.0, 3.0), (0.0, 0.0, 0.0), 50.0, (132, 96))
+    camera = options.pop("camera", PinholeCamera.looking((0.0, -3.0, 3.0), (0.0, 0.0, 0.0), 50.0, (132, 96)))
     surface = PlaneHeight((slope, 0.0), 0.0)
     rays = camera.rays(camera.pixel_grid())
     depth = -camera.position[2] / (rays[..., 2] - slope * rays[..., 0])
@@ -415,6 +415,89 @@ def test_standing_water_goes_on_where_the_picture_cuts_it_and_deepens_away_from_
     assert (np.diff(depth[near]) > -1e-3).all() and depth[near][-1] > depth[near][0] + grid.spacing
     assert (-setting.bed_height[[0, -1]][:, y > 1.0] > 0.5 * depth.max()).all(), "a cut is no shore"
     assert np.allclose(setting.surface_height, 0.0)
+
+
+def sea(shore=2.0, pole=False, **config):
+    """Setting of a sea beyond a beach, built from higher than it is seen: its horizon is at a third of the picture.
+
+    Without what is known of the horizon for comparison; `pole`: something stands before it.
+    """
+    camera = PinholeCamera.looking((0.0, -6.0, 3.0), (0.0, 0.0, 0.0), 50.0, (132, 96))
+    rays = camera.rays(camera.pixel_grid())
+    ground = camera.position - rays * (camera.position[2] / np.minimum(rays[..., 2], -1e-3))[..., None]
+    row = np.arange(96)[:, None] + np.zeros(132)
+    labels = np.where((ground[..., 1] > -shore) & (row >= 32), Label.FLUID, Label.BACKGROUND).astype(np.uint8)
+    if pole:
+        labels[28:36, 60:64] = Label.BACKGROUND
+    wet = labels == Label.FLUID
+    made = []
+    for horizon in (((0.0, 31.0), (132.0, 31.0)), None):
+        seen = PlanEvidence(
+            PlaneHeight((0.0, 0.0), 0.0), labels, ground[wet], camera, np.array([1.0, 0, 0]), closed=True, goes_on=True,
+            ever=wet, horizon=horizon,
+        )  # fmt: skip
+        made.append(channel_setting(seen, ChannelConfig("basin", **{"longest": 64, "cell_limit": 250_000} | config)))
+    return (*made, camera)
+
+
+def test_a_sea_ends_at_its_horizon_and_not_at_a_bank_of_sky():
+    setting, walled, camera = sea(pole=True)
+    grid = setting.terrain.grid
+    assert (walled.bed_height[:, -1] > 0).all(), "a bank, without the horizon"
+    assert (setting.bed_height[:, -1] < 0).all()
+    top = grid.centers()[:, -1, 0].copy()
+    top[:, 2] = 0.0
+    line = camera.project(top)[0][:, 1]
+    assert (line > 31.0 - 2.0).all() and line.max() < 34.0, "no water in the sky, none missing below it"
+    wet = (setting.cell_types == CellType.FLUID).any(axis=2)
+    assert wet[:, -2:].mean() > 0.9, "neither does what stands before the horizon"
+
+
+def test_a_sea_shelves_as_sand_does_and_its_beach_is_flat():
+    setting, walled, _ = sea()
+    grid = setting.terrain.grid
+    x, y = np.moveaxis(grid.centers()[:, :, 0, :2], -1, 0)
+    away = y + 2.0
+    deep = (away > 8 * grid.spacing) & (np.abs(x) < 1.0)
+    # Dean 1977: h = A x^(2/3); a column by which the waterline is off is then a twelfth of it
+    np.testing.assert_allclose(-setting.bed_height[deep], 0.125 * away[deep] ** (2 / 3), rtol=0.12)
+    dry = (away < -2 * grid.spacing) & (np.abs(x) < 1.0)
+    rise = np.polyfit(-away[dry], setting.bed_height[dry], 1)[0]
+    assert 1 / 30 < rise < 1 / 15, "slopes of dry sand, sheltered and exposed"
+    assert -walled.bed_height.min() > 2.0 * -setting.bed_height.min(), "a pool would be as deep as a fifth of its width"
+
+
+def test_a_depth_that_is_asked_for_is_that_of_a_sea_as_well():
+    setting, _, _ = sea(depth_ratio=0.3)
+    assert -setting.bed_height.min() > 1.0
+
+
+def lines_of_sight(scene, points):
+    """Least height (m) of lines from points [n,3] to the camera over the ground, a column and a half away and more."""
+    grid = scene.grid
+    least = np.full(len(points), np.inf)
+    for share in np.linspace(0.0, 1.0, 400)[1:-1]:
+        at = points + share * (scene.camera.position - points)
+        column = grid.cell_of(at)[:, :2]
+        inside = ((column >= 0) & (column < grid.shape[:2])).all(axis=1)
+        inside &= np.hypot(*(at - points)[:, :2].T) > 1.5 * grid.spacing
+        least[inside] = np.minimum(least[inside], at[inside, 2] - scene.bed[tuple(column[inside].T)])
+    return least
+
+
+def test_no_bank_and_no_rock_hides_water_that_is_seen():
+    flat = PinholeCamera.looking((0.0, -4.0, 0.8), (0.0, 0.0, 0.0), 50.0, (132, 96))
+    scene = channel(camera=flat)
+    x, y = columns(scene)
+    clear = np.hypot(x - ROCK[0], y - ROCK[1]) > ROCK_RADIUS + scene.grid.spacing
+    seen = (np.abs(y) < 0.5 * WIDTH - scene.grid.spacing) & (np.abs(x) < 1.0) & clear
+    points = np.stack([x[seen], y[seen], scene.level[seen]], axis=1)
+    shadow = (points[:, 1] > ROCK[1]) & (np.abs(points[:, 0] - ROCK[0]) < 2 * ROCK_RADIUS)  # not seen, in the picture
+    assert (lines_of_sight(scene, points[~shadow]) > -0.3 * scene.grid.spacing).all()
+    bank = (y > 0.5 * WIDTH + 2 * scene.grid.spacing) & (np.abs(x) < 1.0)
+    assert scene.bed[bank].max() > 1.5 * scene.grid.spacing, "the far one rises behind the water"
+    near = (y < -0.5 * WIDTH - scene.grid.spacing) & (np.abs(x) < 1.0)
+    assert (scene.bed[near] > 0).all(), "above the water it stays"
 
 
 def test_standing_water_at_rest_stays_at_rest():

@@ -15,12 +15,16 @@ from fluidlift.shape.depth_surface import solid_heights
 from fluidlift.shape.ground_mesh import ground_mesh
 from fluidlift.shape.plan import Extent, Plan, PlanEvidence, dry_columns, extent_of, plan_of, wide_ends, with_seen
 from fluidlift.shape.terrain import at_cells, signed_distance_from, to_corners, unit
-from fluidlift.types import CellType, FluidKind, Grid, Label, Setting, Terrain, kind_of, triple
+from fluidlift.types import CellType, FluidKind, Grid, Label, PinholeCamera, Setting, Terrain, kind_of, triple
 
 INLET = 2.5
 """cells along the flow that an inlet is long"""
 EDGE = 2.0
 """1 / cosine of 60 degrees: what is steeper in a stream is the side of a chute, not a sheet"""
+LOWEST = 0.25
+"""cells by which ground stands above the water beside it, however flat it is looked at"""
+BANK = 0.9
+"""slope of a bank above the water: 42 degrees, soil that plants hold"""
 FLAT = 0.3
 """slope at which a surface says as much as the bulk flow about where its water runs"""
 
@@ -81,6 +85,10 @@ def channel_setting(seen: PlanEvidence, config: ChannelConfig) -> Setting:
     depth = share * extent.width
     if config.in_metres and config.depth_ratio is None and kind.runs_nearly_level and not seen.closed:
         depth = cross_section.usual_depth(extent.width, share)
+    beach = seen.reaches_horizon and config.depth_ratio is None
+    if beach:  # a guess for pools would be a bay as deep as a fifth of what is seen of it
+        across = np.linalg.norm(extent.high - extent.low, keepdims=True)
+        depth = float(cross_section.shelving(across)[0])
     spacing = max((extent.high - extent.low).max() / config.longest, depth / 10)
     spacing = min(spacing, depth / 4)  # fewer than four cells hold no velocity profile
     for _ in range(60):
@@ -89,6 +97,9 @@ def channel_setting(seen: PlanEvidence, config: ChannelConfig) -> Setting:
             break
         spacing *= 1.05
     plan = with_seen(plan_of(seen, grid, extent), extent.visible, grid)
+    if plan.beyond.any():  # a sea ends where its horizon is: the box as well
+        grid = _within_horizon(grid, plan)
+        plan = with_seen(plan_of(seen, grid, extent), extent.visible, grid)
     thin = seen.surface.sheet(grid.centers()[:, :, 0, :2])
     rim = np.zeros_like(plan.wet)
     if kind.enters_over_rim or seen.surface.steps:
@@ -96,7 +107,9 @@ def channel_setting(seen: PlanEvidence, config: ChannelConfig) -> Setting:
         rim = above_rim(plan.wet, plan.level, seen.along, spacing, foot_of_bank)
         if not kind.enters_over_rim:  # the back edge of the pool below a chute is a bank
             rim &= _upper(plan.wet, plan.level)
-    ground = _bed_and_banks(plan, grid, (depth, thin), extent, kind, rim)
+    ground = _bed_and_banks(plan, grid, (depth, thin), extent, kind, rim, beach=beach)
+    shown = np.minimum(ground.shown, np.maximum(_sight_lines(plan, grid, seen.camera), plan.level + LOWEST * spacing))
+    ground = replace(ground, bed=np.where(plan.label == Label.FLUID, ground.bed, shown), shown=shown)
     ground = _as_seen(ground, plan, grid, seen, extent)
     return _fill_channel(grid, plan, ground, extent.reach, seen, kind)
 
@@ -115,6 +128,14 @@ def _channel_grid(surface, low, high, depth, spacing) -> Grid:
     return Grid(triple(int(np.ceil(s / spacing)) for s in size), spacing, origin)
 
 
+def _within_horizon(grid: Grid, plan: Plan) -> Grid:
+    """The box without the columns at its sides that all lie beyond the horizon."""
+    kept = [np.flatnonzero((~plan.beyond).any(axis=1 - axis)) for axis in (0, 1)]
+    first, last = np.array([k[0] for k in kept]), np.array([k[-1] for k in kept])
+    low = np.array([*(grid.low[:2] + first * grid.spacing), grid.low[2]])
+    return Grid((*(last - first + 1).tolist(), grid.shape[2]), grid.spacing, triple(low.tolist()))
+
+
 def _ground_samples(low, high, n: int = 24) -> np.ndarray:
     x, y = np.meshgrid(np.linspace(low[0], high[0], n), np.linspace(low[1], high[1], n), indexing="ij")
     return np.stack([x, y], -1)
@@ -122,27 +143,56 @@ def _ground_samples(low, high, n: int = 24) -> np.ndarray:
 
 def _bed_and_banks(
     plan: Plan, grid: Grid, depths: tuple[float, Float[np.ndarray, "nx ny"]], extent: Extent, kind: FluidKind,
-    rim: Bool[np.ndarray, "nx ny"],
+    rim: Bool[np.ndarray, "nx ny"], *, beach: bool = False,
 ) -> _Ground:  # fmt: skip
     """Ground height and where there is water, per column; `depths`: the greatest, and the most that each column has;
-    `rim`: what comes over it is as deep there as anywhere, it is no bank."""
+    `rim`: what comes over it is as deep there as anywhere, it is no bank; `beach`: it shelves as sand does."""
     h, (depth, thin) = grid.spacing, depths
     wet, rock = plan.wet, plan.label == Label.SOLID  # rocks stand in the water: its banks are further out
     reach = cross_section.Reach(wet, rock, plan.level, plan.along, plan.speed, h)
     gx, gy = np.gradient(plan.level, h)
     steep = np.sqrt(1 + gx**2 + gy**2)  # thickness is meant across the sheet, columns are vertical
     steep = steep if kind.enters_over_rim else np.minimum(steep, EDGE)
-    section = cross_section.depth_along(reach, depth, extent.width, kind)
-    reach = replace(reach, wet=wet | rim)
-    below = np.maximum(np.minimum(cross_section.thickness(reach, section, extent.width), thin), 0.7 * h)
+    if beach:
+        sea = distance_inside(wet | plan.beyond, h)
+        below = cross_section.beside_rocks(reach, cross_section.shelving(sea))
+        rise = cross_section.FORESHORE
+    else:
+        section = cross_section.depth_along(reach, depth, extent.width, kind)
+        reach = replace(reach, wet=wet | rim)
+        below, rise = cross_section.thickness(reach, section, extent.width), BANK
+    below = np.maximum(np.minimum(below, thin), 0.7 * h)
     outside = distance_inside(~wet, h)
-    bank = plan.level + steep * np.minimum(0.4 * h + 0.9 * outside, 0.5 * depth + 2.5 * h)
-    shown = np.where(wet, plan.level - below * steep, bank)
+    bank = plan.level + steep * np.minimum(0.4 * h + rise * outside, 0.5 * depth + 2.5 * h)
+    shown = np.where(wet | plan.beyond, plan.level - below * steep, bank)
     # one pass of smoothing in the water: steps of single cells are of the map, not of the bed
     smooth = np.minimum(ndimage.gaussian_filter(shown, 0.7), plan.level - 0.5 * h * steep)
     shown = np.where(wet & ~rock, smooth, shown)
     shown = np.where(rock, plan.level + cross_section.rock_height(reach), shown)
     return _Ground(shown, shown, wet & ~rock)
+
+
+def _sight_lines(plan: Plan, grid: Grid, camera: PinholeCamera) -> Float[np.ndarray, "nx ny"]:
+    """z (m) of the lowest line of sight above each column, from the camera to water that it sees; inf without any.
+
+    What is seen is hidden by nothing: so high at most are the bank before the water, and the rock before the water
+    behind it.
+    """
+    h = grid.spacing
+    points = np.concatenate([grid.centers()[:, :, 0, :2], plan.level[..., None]], axis=-1)
+    target = points[plan.known & (plan.label == Label.FLUID)]
+    way = camera.position - target
+    level = np.linalg.norm(way[:, :2], axis=1)
+    lowest = np.full(plan.label.shape, np.inf)
+    # samples every half column, from the edge of the next one; a line that leaves the box does not come back
+    for step in np.arange(1.0, 2.0 * np.hypot(*plan.label.shape)) * 0.5 * h + 0.5 * h:
+        at = target + way * (step / np.maximum(level, 1e-9))[:, None]
+        column = grid.cell_of(at)[:, :2]
+        inside = (step < level) & ((column >= 0) & (column < plan.label.shape)).all(axis=1)
+        if not inside.any():
+            break
+        np.minimum.at(lowest, tuple(column[inside].T), at[inside, 2])
+    return lowest
 
 
 def _as_seen(ground: _Ground, plan: Plan, grid: Grid, seen: PlanEvidence, extent: Extent) -> _Ground:

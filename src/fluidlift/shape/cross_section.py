@@ -37,6 +37,14 @@ RIVERS = (1.0, 5.0)
 """m: width up to which nothing is known of a channel (a flume, a gutter, a film), and from which it is such a river"""
 
 
+SHELF = 0.125
+"""m^(1/3), depth of a beach's bed over (distance from its waterline)^(2/3): equilibrium profile of sand of 0.3 mm
+(Dean 1977; 1991, Journal of Coastal Research 7; medium sand, and the middle of what beaches have)"""
+FORESHORE = 0.05
+"""slope of its dry sand: of 0.3 mm 1 in 15 where it is sheltered, 1 in 30 before open sea (Wiegel 1964):
+between them"""
+
+
 @dataclass(frozen=True)
 class Reach:
     """What is known of the water from above, one entry per column."""
@@ -76,6 +84,11 @@ def usual_depth(width: float, ratio: float) -> float:
     known = float(np.clip(np.log(width / small) / np.log(large / small), 0.0, 1.0))
     assumed = ratio * width
     return min(assumed, assumed ** (1.0 - known) * (RIVER_DEPTH * width**RIVER_POWER) ** known)
+
+
+def shelving(distance: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Depth (m) of a sea at a distance (m) from its beach."""
+    return SHELF * np.maximum(distance, 0.0) ** (2.0 / 3.0)
 
 
 def depth_along(reach: Reach, depth: float, width: float, kind: str | FluidKind) -> Float[np.ndarray, "nx ny"]:
@@ -143,10 +156,14 @@ def thickness(
     steep = STEEPEST * np.maximum(bank - 0.5 * reach.spacing, 0.0) / np.maximum(section, 1e-12)
     share = np.maximum(share, np.minimum(steep, swiftness(reach, width)))
     below = section * share / (1.0 + share**6) ** (1 / 6)  # the smaller of both, with a rounded foot
-    if reach.rock.any():
-        beside = ndimage.distance_transform_edt(~reach.rock) * reach.spacing
-        below = np.minimum(below, ROCK_FLANK * beside)
-    return np.where(reach.wet, below, 0.0)
+    return np.where(reach.wet, beside_rocks(reach, below), 0.0)
+
+
+def beside_rocks(reach: Reach, depth: Float[np.ndarray, "nx ny"]) -> Float[np.ndarray, "nx ny"]:
+    """Depth (m) with the flanks of what stands in the water."""
+    if not reach.rock.any():
+        return depth
+    return np.minimum(depth, ROCK_FLANK * ndimage.distance_transform_edt(~reach.rock) * reach.spacing)
 
 
 def swiftness(reach: Reach, width: float) -> Float[np.ndarray, "nx ny"]:

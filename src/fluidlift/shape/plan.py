@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from fluidlift.errors import require
+from fluidlift.errors import require, required
 from fluidlift.shape.cross_section import distance_inside
 from fluidlift.shape.heights import HeightModel
 from fluidlift.types import Grid, Label, PinholeCamera
@@ -20,6 +20,9 @@ COARSE = 96
 
 TAIL = 0.05
 """of the width: what is thinner than twice this is a tail of the mask, not a part of the stream"""
+
+AT_HORIZON = 2
+"""px from the horizon's line to the outline of what ends there: that of a mask is a pixel or two inside"""
 
 GRAZING = 8.0
 """a column's pixel may be so many times longer along the view than the median one: beyond, rows of pixels on the far
@@ -50,6 +53,28 @@ class PlanEvidence:
     """standing water, closed, of which the picture may cut a part off: it goes on there"""
     ever: Bool[np.ndarray, "h w"] | None = None
     """pixels that show fluid at some time of the clip; None: not known"""
+    horizon: tuple[tuple[float, float], tuple[float, float]] | None = None
+    """px (u, v), where it crosses the left and the right edge of the picture, or beyond; None: not known. A camera that
+    was raised for a relief looks down on a plane there and above, where the picture shows the sky"""
+
+    @cached_property
+    def reaches_horizon(self) -> bool:
+        """Whether this is a sea: its water goes on to the horizon in half of the picture's columns, or more."""
+        if self.horizon is None or not self.goes_on:
+            return False
+        wet = self.labels != Label.BACKGROUND
+        line = self._horizon_at(np.arange(wet.shape[1]) + 0.5)
+        return float(np.mean(wet.any(axis=0) & (wet.argmax(axis=0) <= line + AT_HORIZON))) >= 0.5
+
+    def beyond_horizon(self, uv: Float[np.ndarray, "*n 2"]) -> Bool[np.ndarray, "*n"]:
+        """Which points (px) of a sea's plane lie where the picture, or what goes on beside it, shows the sky."""
+        if not self.reaches_horizon:
+            return np.zeros(uv.shape[:-1], bool)
+        return uv[..., 1] < self._horizon_at(uv[..., 0])
+
+    def _horizon_at(self, u: np.ndarray) -> np.ndarray:
+        (left, first), (right, last) = required(self.horizon, "no horizon")
+        return first + (u - left) * (last - first) / (right - left)
 
     @cached_property
     def along(self) -> Float[np.ndarray, "2"]:
@@ -79,6 +104,8 @@ class Plan:
     """of the surface, m/s; nan where it is not known"""
     known: Bool[np.ndarray, "nx ny"]
     """in the picture; the others go on as the nearest of these along the stream"""
+    beyond: Bool[np.ndarray, "nx ny"]
+    """beyond the horizon of a sea: neither water nor bank"""
 
     @property
     def wet(self) -> Bool[np.ndarray, "nx ny"]:
@@ -193,7 +220,11 @@ def plan_of(seen: PlanEvidence, grid: Grid, extent: Extent | None = None) -> Pla
     row, col, z = seen.camera.nearest_pixels(points)
     size = np.array(seen.camera.size)
     known = (z > 0) & (uv >= 0).all(axis=-1) & (uv < size).all(axis=-1)
+    beyond = (z > 0) & seen.beyond_horizon(uv)
     label = np.where(known, seen.labels[row, col], Label.BACKGROUND).astype(np.uint8)
+    if seen.reaches_horizon:  # what stands at the line is no far bank: the water goes on to it
+        line = known & seen.beyond_horizon(uv - np.array([0.0, AT_HORIZON]))
+        known &= ~line
     speed = np.full(label.shape, np.nan)
     if seen.speed is not None:
         speed = np.where(known & (label == Label.FLUID), seen.speed[row, col], np.nan)
@@ -211,7 +242,8 @@ def plan_of(seen: PlanEvidence, grid: Grid, extent: Extent | None = None) -> Pla
         label = cleaned(label, extent.width, grid.spacing)
         if not seen.closed:
             label = _without_corners(label, source)
-    return Plan(label, level, s, speed, known)
+    label[beyond] = Label.BACKGROUND
+    return Plan(label, level, s, speed, known, beyond)
 
 
 def dry_columns(seen: PlanEvidence, plan: Plan, grid: Grid) -> Bool[np.ndarray, "nx ny"]:

@@ -29,7 +29,7 @@ from fluidlift.shape.frame_pictures import working_size
 from fluidlift.shape.hints import VOICE, Clicks, Point, clicks_at, heed, holes_asked_for
 from fluidlift.shape.intermittently_wet import WashedGround, bare_over_time, washed_ground
 from fluidlift.shape.mirrored_edges import mirrored_edges
-from fluidlift.shape.moving_front import advancing_labels
+from fluidlift.shape.moving_front import advancing_labels, without_strays
 from fluidlift.shape.moving_solids import SharedPairs, moving_solids
 from fluidlift.shape.open_sea import reaching_over, sea_horizon, with_sea
 from fluidlift.shape.open_water import with_open_water
@@ -284,6 +284,8 @@ def segment(
     tell(0.5, "labels")
     writer = LabelWriter((frames, height, width), out)
     share = write_labels(found, writer, small_inside, tell)
+    if known.advances:
+        share -= without_strays(writer.labels) / writer.labels.size
     told = doubts(share, known.told) + mirror_notice(known.mirrored)
     return PixelLabels(writer.labels, writer.confidence, warnings=told)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -23,7 +24,9 @@ from fluidlift.shape import (
     standing,
 )
 from fluidlift.shape.frame_pictures import typical_picture
+from fluidlift.shape.kind import level_camera
 from fluidlift.shape.kinds import builder_of
+from fluidlift.shape.view import horizon_line
 from fluidlift.types import (
     CellType,
     FluidKind,
@@ -147,10 +150,17 @@ def _setting(
         kind, s.front, fluid, seen.start, seen.united, camera, to_world, depth, half, bulk, config, s.falling.pixels,
         speed=speed, scene_depth=scene, in_metres=s.scale.source != "assumed",
         closed=parts.puddle or kind.is_standing_water, goes_on=kind.is_standing_water,
-        pool=parts.lying if kind.rises_from_pool else None,
+        pool=parts.lying if kind.rises_from_pool else None, horizon=_horizon(s, camera),
     )  # fmt: skip
     lies = ~s.falling.pixels[s.visible]
     return composite.composed(setting, s.falling, to_world, s.points[lies], s.velocities[lies], camera)
+
+
+def _horizon(s: Sighted, camera: PinholeCamera) -> tuple[tuple[float, float], tuple[float, float]]:
+    """px, the horizon as the camera was seen to look, not as a relief is built."""
+    if s.up.raised:
+        camera = level_camera(camera, replace(s.up, pitch=s.up.pitch - s.up.raised))
+    return horizon_line(camera)
 
 
 def _said(flow: SaidFlow, visible: np.ndarray) -> np.ndarray:

@@ -24,8 +24,9 @@ class Basin:
         )
 
     def mainstream(self, bulk):
-        """None: a level direction, for files that hold one."""
-        return np.array([bulk[0], bulk[1], 0.0])
+        """None: across the view, along the waves of a sea and its horizon. Its box ends there, and beside the picture
+        it goes on so."""
+        return np.array([1.0, 0.0, 0.0])
 
 
 BUILDER = Basin()

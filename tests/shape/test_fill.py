@@ -2,6 +2,7 @@
 
 import time
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -225,3 +226,25 @@ def test_points_that_are_as_far_from_all_of_the_shell_find_a_colour_in_bounded_w
     added = fill(g, spacing=0.04, rng=np.random.default_rng(0), rays=3)
     side = np.abs(added.means[:, 0]) > 0.08
     assert np.mean((added.rgb[side, 0] > 0.5) == (added.means[side, 0] > 0)) > 0.99
+
+
+def test_a_speck_of_the_shell_does_not_colour_what_is_filled():
+    g = shell(sphere)
+    sh = np.full_like(g.sh, 0.2)
+    odd = np.random.default_rng(3).random(len(g)) < 0.02
+    sh[odd, 0] = (-1.5, 2.5, 2.0)
+    scales = np.where(odd[:, None], 0.3, 1.0) * g.scales  # glints are small
+    added = fill(replace(g, sh=sh.astype(np.float32), scales=scales.astype(np.float32)), spacing=SPACING,
+                 rng=np.random.default_rng(0))  # fmt: skip
+    assert len(added) > 500
+    np.testing.assert_allclose(added.sh[:, 0], 0.2, atol=0.25)
+    assert np.abs(added.sh[:, 0] - 0.2).mean() < 0.02
+
+
+def test_what_is_filled_has_the_colours_of_the_side_it_is_nearer_to():
+    g = shell(sphere)
+    sh = g.sh.copy()
+    sh[:, 0] = np.where(g.means[:, :1] > 0, 0.5, -0.5)
+    added = fill(replace(g, sh=sh), spacing=SPACING, rng=np.random.default_rng(0))
+    side = np.abs(added.means[:, 0]) > 4 * SPACING
+    assert (np.sign(added.sh[side, 0, 0]) == np.sign(added.means[side, 0])).mean() > 0.99

@@ -21,6 +21,9 @@ INLET = 2.5
 """cells along the flow that an inlet is long"""
 EDGE = 2.0
 """1 / cosine of 60 degrees: what is steeper in a stream is the side of a chute, not a sheet"""
+SHALLOWEST = 8.0
+"""cells, depth of a sea at its far end, at least: of 1 to 3 cells, as its profile had them, its level rose by a quarter
+of one and more; of 10 it stays"""
 LOWEST = 0.25
 """cells by which ground stands above the water beside it, however flat it is looked at"""
 BANK = 0.9
@@ -89,6 +92,7 @@ def channel_setting(seen: PlanEvidence, config: ChannelConfig) -> Setting:
     if beach:  # a guess for pools would be a bay as deep as a fifth of what is seen of it
         across = np.linalg.norm(extent.high - extent.low, keepdims=True)
         depth = float(cross_section.shelving(across)[0])
+        depth = max(depth, SHALLOWEST * float((extent.high - extent.low).max()) / config.longest)
     spacing = max((extent.high - extent.low).max() / config.longest, depth / 10)
     spacing = min(spacing, depth / 4)  # fewer than four cells hold no velocity profile
     for _ in range(60):
@@ -155,7 +159,8 @@ def _bed_and_banks(
     steep = steep if kind.enters_over_rim else np.minimum(steep, EDGE)
     if beach:
         sea = distance_inside(wet | plan.beyond, h)
-        below = cross_section.beside_rocks(reach, cross_section.shelving(sea))
+        below = cross_section.shelving(sea)
+        below = cross_section.beside_rocks(reach, below * max(1.0, depth / below.max()))
         rise = cross_section.FORESHORE
     else:
         section = cross_section.depth_along(reach, depth, extent.width, kind)

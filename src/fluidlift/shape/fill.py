@@ -44,6 +44,9 @@ huge ones would swell the hull by `RADIUS_MAX`"""
 WORK_MAX = 200_000_000
 """visits of voxels by Gaussians at most; radii shrink until they fit"""
 
+EVENED = 2.0
+"""voxels, standard deviation over which colours of what is filled are averaged: a cell of the simulation"""
+
 CHUNK = 500_000
 """Gaussians whose matrices are made at a time"""
 
@@ -249,7 +252,8 @@ def fill(
         closed_below: terrain that closes the body from below.
 
     Returns:
-        Only those added: round, half a voxel wide, colour and opacity of the nearest Gaussian of the body.
+        Only those added: round, half a voxel wide, with the opacity of the nearest Gaussian of the body and the colour
+        of those around it.
     """
     shell = hull(gaussians, spacing=spacing, closed_below=closed_below)
     grid, voxels = shell.grid, shell.voxels
@@ -288,7 +292,23 @@ def fill(
     nearest = holder[tuple(index[(slice(None), *chosen.T)])]
     quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(means), 1))
     opacities = np.nan_to_num(gaussians.opacities[nearest])
-    return Gaussians(means, quats, np.full((len(means), 3), width), opacities, gaussians.sh[nearest])
+    sh = np.zeros((len(means), *gaussians.sh.shape[1:]), gaussians.sh.dtype)
+    sh[:, 0] = _evened(gaussians.select(usable), cells, grid)[tuple(index[(slice(None), *chosen.T)])]
+    return Gaussians(means, quats, np.full((len(means), 3), width), opacities, sh)
+
+
+def _evened(gaussians: Gaussians, cells: np.ndarray, grid: Grid) -> Float[np.ndarray, "nx ny nz 3"]:
+    """Mean colour (coefficients of degree 0) around each voxel that holds a Gaussian, by what each of them covers.
+
+    Where splats are optimised together, one may have any colour that its neighbours make up for: alone it says nothing.
+    """
+    wide = np.clip(np.nan_to_num(gaussians.scales / grid.spacing), 0.0, 1.0)  # a voxel at most: more is not here
+    covers = np.nan_to_num(gaussians.opacities) * np.sort(wide, axis=1)[:, 1:].prod(axis=1) + 1e-6
+    flat = np.ravel_multi_index(tuple(cells.T), grid.shape)
+    values = np.column_stack([covers[:, None] * gaussians.sh[:, 0], covers])
+    sums = (np.bincount(flat, v, grid.cells).reshape(grid.shape).astype(np.float32) for v in values.T)
+    *colour, total = (ndimage.gaussian_filter(v, EVENED, mode="constant") for v in sums)
+    return np.stack(colour, axis=-1) / np.maximum(total, 1e-30)[..., None]
 
 
 def _boxed(shell: np.ndarray, cells: np.ndarray, open_below: bool) -> Bool[np.ndarray, " n"]:

@@ -29,8 +29,6 @@ PACKAGES = ("shape", "motion")
 BESIDE = ("types.flow", "types.kind")
 """modules with numbers that both packages read"""
 LEFT_OUT = {
-    "GRAVITY": "physics",
-    "STANDARD_GRAVITY": "physics",
     "CELLS_MAX": "a limit of memory",
     "WORK_MAX": "a limit of work",
     "CHUNK": "memory at a time",

@@ -8,6 +8,7 @@ import av
 import numpy as np
 import pytest
 import yaml
+from catalogue import plume_pictures
 
 from fluidlift import __version__
 from fluidlift.cli import DONE, FAILED, REJECTED, USAGE, WITH_WARNINGS, main
@@ -308,17 +309,8 @@ def test_the_user_decides_the_kind(stream_clip, tmp_path, hasty, kind):
 
 
 def test_smoke_that_rises_becomes_a_plume(tmp_path, clip_file, hasty):
-    """Grey texture that rises 2 px per frame in a growing column before a dark wall."""
-    rng = np.random.default_rng(0)
-    texture = np.kron(rng.uniform(90, 230, (60, 32)), np.ones((2, 3)))
-    row, col = np.mgrid[:64, :96]
-    frames = []
-    for t in range(12):
-        smoke = (np.abs(col - 48) < 8 + 0.12 * (60 - row) + 2 * np.sin(row / 4 + t)) & (row > 40 - 3 * t) & (row < 60)
-        picture = np.where(smoke, texture[2 * t : 2 * t + 64], 25)
-        frames.append(np.repeat(picture[..., None], 3, axis=-1).astype(np.uint8))
     folder = tmp_path / "x.fluid"
-    clip = clip_file(tmp_path / "smoke.mp4", np.stack(frames))
+    clip = clip_file(tmp_path / "smoke.mp4", plume_pictures())
     code = main(["make", str(clip), "-o", str(folder), "--size", "1", *hasty, "--set", "shape.cells=24"])
     assert code in (DONE, WITH_WARNINGS)
     manifest = json.loads((folder / "manifest.json").read_text())

@@ -36,14 +36,14 @@ def test_whole_numbers_stay_whole_and_collections_keep_their_form(tuned):
     np.testing.assert_array_equal(tuned.scaled(np.array([1.0, 3.0]), 0.5), [0.5, 1.5])
 
 
-def test_numbers_are_found_also_where_several_share_a_line_and_physics_is_left_out(numbers):
+def test_numbers_are_found_also_where_several_share_a_line_and_limits_of_memory_are_left_out(numbers):
     found, left_out = numbers
     keys = {c.key for c in found}
     assert {"shape.kind.LEAST_SURE", "shape.view.habit.OPEN_OVER", "shape.view.habit.OPEN_DOWN"} <= keys
-    assert "shape.registration.STANDARD_GRAVITY" in left_out and not keys & set(left_out)
+    assert "shape.fill.CELLS_MAX" in left_out and not keys & set(left_out)
     early = {c.key for c in found if c.at_import}
     # a default argument; a constant made of another; a compiled kernel that holds it
-    assert {"motion.mainstream.OBSERVED_CONFIDENCE", "shape.generate.SHORE", "motion.multiframe.TRIM"} <= early
+    assert {"shape.depth_surface.SLOPES", "shape.generate.SHORE", "motion.multiframe.TRIM"} <= early
     assert "shape.kind.LEAST_SURE" not in early
 
 

@@ -32,10 +32,10 @@ class MissingPackage(FluidliftError):
     """An optional package is not installed; the message says which and how to install it."""
 
 
-def required(value: T | None, got: str, needed: str = "", do: str = "") -> T:
+def required(value: T | None, got: str, needed: str = "") -> T:
     """The value; `ValueError` as `require` raises it where it is None."""
     if value is None:
-        raise ValueError(str(InputRejected(got, needed, do)))
+        raise ValueError(str(InputRejected(got, needed)))
     return value
 
 

@@ -30,17 +30,6 @@ def model_of(name, weights, **options):
     return make_depth_estimator(name, ModelChoice(weights, announce=quiet, **options))
 
 
-@pytest.fixture(scope="module")
-def transformers():
-    pytest.importorskip("safetensors", reason="safetensors is not installed")
-    library = pytest.importorskip("transformers", reason="transformers is not installed")
-    try:
-        _ = library.DepthAnythingForDepthEstimation, library.DepthProForDepthEstimation
-    except (ImportError, RuntimeError, OSError) as error:
-        pytest.skip(f"transformers does not start: does torchvision fit torch? ({str(error).splitlines()[0]})")
-    return library
-
-
 def saved_depth_anything(transformers, folder, **options):
     """Depth Anything with random weights and few channels, in a folder."""
     torch.manual_seed(0)

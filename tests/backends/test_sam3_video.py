@@ -20,17 +20,6 @@ def quiet(line: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def transformers():
-    pytest.importorskip("safetensors", reason="safetensors is not installed")
-    library = pytest.importorskip("transformers", reason="transformers is not installed")
-    try:
-        _ = library.Sam3VideoModel
-    except (ImportError, RuntimeError, OSError) as error:
-        pytest.skip(f"transformers does not start: does torchvision fit torch? ({str(error).splitlines()[0]})")
-    return library
-
-
-@pytest.fixture(scope="module")
 def torchvision():
     try:
         import torchvision

@@ -40,17 +40,6 @@ def no_flow() -> PixelFlow:
 
 
 @pytest.fixture(scope="module")
-def transformers():
-    pytest.importorskip("safetensors", reason="safetensors is not installed")
-    library = pytest.importorskip("transformers", reason="transformers is not installed")
-    try:
-        _ = library.Sam2VideoModel
-    except (ImportError, RuntimeError, OSError) as error:
-        pytest.skip(f"transformers does not start: does torchvision fit torch? ({str(error).splitlines()[0]})")
-    return library
-
-
-@pytest.fixture(scope="module")
 def tiny(transformers, tmp_path_factory):
     """SAM 2 with random weights and few channels, and the folder that it was saved to."""
     vision = {

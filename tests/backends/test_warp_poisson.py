@@ -4,6 +4,7 @@ import importlib
 
 import numpy as np
 import pytest
+from boxes import closed_box
 
 from fluidlift.backends.warp_device import warp_device
 from fluidlift.numerics.multigrid_plain import plain_levels, plain_v_cycle
@@ -17,15 +18,6 @@ from fluidlift.backends.warp_poisson import WarpPoisson  # noqa: E402
 
 DEVICE = warp_device("cpu")
 SPACING = 0.1
-
-
-def closed_box(shape):
-    weights = []
-    for axis in range(3):
-        w = np.ones(tuple(n + (a == axis) for a, n in enumerate(shape)), np.float32)
-        np.moveaxis(w, axis, 0)[[0, -1]] = 0.0
-        weights.append(w)
-    return weights
 
 
 def with_gaps(unknown, weights, seed=0):

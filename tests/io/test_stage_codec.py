@@ -138,7 +138,7 @@ def segmentation() -> stages.Segmentation:
 
 def refined() -> stages.Refined:
     body = Gaussians.isotropic(floats(6, 3), 0.1, np.full((6, 3), 0.5), 0.9)
-    return stages.Refined(body, 3, 2, 1, 0, "none", 20.0, 25.5, True, (0.2, 0.1), ((20.0, 21.0),))
+    return stages.Refined(body, 3, 2, 1, 0, 20.0, 25.5, True)
 
 
 def simulation() -> stages.Simulation:

@@ -9,7 +9,6 @@ from fluidlift.look.ground_picture import (
     GroundLight,
     GroundMeshes,
     bounced,
-    ground_picture,
     received,
     spread_directions,
 )
@@ -32,6 +31,10 @@ def body(mesh):
     return TriangleMesh(np.array(mesh.vertices), np.array(mesh.faces))
 
 
+def ground_picture(meshes, environment, behind=None, lit=None):
+    return GroundMeshes(meshes, environment, lit).picture(CAMERA, behind)
+
+
 def lamp(direction=(0.6, 0.0, 0.8), brightness=300.0, around=0.2):
     """A small bright light in a gray world."""
     from fluidlift.look.environment_lookup import grid_directions
@@ -41,7 +44,7 @@ def lamp(direction=(0.6, 0.0, 0.8), brightness=300.0, around=0.2):
 
 
 def test_open_ground_in_a_white_world_has_its_own_colour():
-    picture = ground_picture([floor(color=(0.8, 0.4, 0.1))], CAMERA, WHITE)
+    picture = ground_picture([floor(color=(0.8, 0.4, 0.1))], WHITE)
     expected = linear_from_srgb(np.array([0.8, 0.4, 0.1]))
     # of light along the ground a pixel of the shadow map more or less is lost: 0.3 %
     np.testing.assert_allclose(picture.image[picture.depth > 0], np.broadcast_to(expected, (120 * 90, 3)), rtol=3e-3)
@@ -78,7 +81,7 @@ def test_a_texture_lies_where_its_coordinates_say():
     plain = floor()
     uv = np.stack([plain.vertices[plain.faces][..., 0] / 8 + 0.5, 0.5 - plain.vertices[plain.faces][..., 1] / 8], -1)
     mesh = TriangleMesh(plain.vertices, plain.faces, plain.colors, uv, texture)
-    image = ground_picture([mesh], CAMERA, WHITE).image
+    image = ground_picture([mesh], WHITE).image
     # white to the right of x = 0, the middle column; half a texel of 0.125 m, 3 px in front, is between
     assert image[:, :56].max() < 0.01 and image[:, 64:].min() > 0.99
 
@@ -153,26 +156,26 @@ def test_nearer_meshes_and_nearer_things_behind_hide_ground():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     red = TriangleMesh(np.array(ball.vertices), np.array(ball.faces), np.tile([1.0, 0, 0], (len(ball.vertices), 1)))
     for meshes in ([floor(), red], [red, floor()]):
-        picture = ground_picture(meshes, CAMERA, WHITE, lit=NO_AMBIENT)
+        picture = ground_picture(meshes, WHITE, lit=NO_AMBIENT)
         assert picture.image[40, 60, 1] < 0.01 < picture.image[40, 60, 0]
         assert picture.depth[40, 60] < np.linalg.norm(CAMERA.position) - 0.4
     depth = np.zeros((90, 120))
     depth[:, :60] = 0.5  # a curtain
     behind = Behind(np.full((90, 120, 3), 7.0), depth)
-    picture = ground_picture([floor()], CAMERA, WHITE, behind, lit=NO_AMBIENT)
+    picture = ground_picture([floor()], WHITE, behind, lit=NO_AMBIENT)
     assert (picture.image[:, :60] == 7.0).all() and (picture.depth[:, :60] == 0.5).all()
     assert (picture.image[:, 60:] < 1.0).all()
 
 
 def test_without_meshes_the_environment_is_seen_and_with_small_ones_around_them():
     sky = lamp()
-    empty = ground_picture([], CAMERA, sky)
+    empty = ground_picture([], sky)
     np.testing.assert_array_equal(empty.image, sky.toward(CAMERA.rays(CAMERA.pixel_grid())))
     assert not empty.depth.any()
-    tile = ground_picture([floor(half=0.3)], CAMERA, sky)
+    tile = ground_picture([floor(half=0.3)], sky)
     np.testing.assert_array_equal(tile.image[tile.depth == 0], empty.image[tile.depth == 0])
     with pytest.raises(ValueError, match="background"):
-        ground_picture([floor()], CAMERA, sky, Behind(np.zeros((5, 5, 3)), np.zeros((5, 5))))
+        ground_picture([floor()], sky, Behind(np.zeros((5, 5, 3)), np.zeros((5, 5))))
 
 
 def test_what_is_kept_from_frame_to_frame_changes_no_picture():
@@ -191,7 +194,7 @@ def test_what_is_kept_from_frame_to_frame_changes_no_picture():
         np.testing.assert_array_equal(one.image, fresh.image)
         np.testing.assert_array_equal(one.depth, fresh.depth)
     still = kept.picture(CAMERA)
-    np.testing.assert_array_equal(still.image, ground_picture([floor()], CAMERA, sky).image)
+    np.testing.assert_array_equal(still.image, ground_picture([floor()], sky).image)
     assert np.abs(still.image - one.image).max() > 0.1  # and the shadows are those of the frame
 
 
@@ -199,7 +202,7 @@ def test_what_moves_is_lit_as_if_it_stayed():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     ball.apply_translation([0.0, 0.0, 0.5])
     apart = GroundMeshes([floor()], Environment.sky()).picture(CAMERA, bodies=[body(ball)])
-    whole = ground_picture([floor(), body(ball)], CAMERA, Environment.sky())
+    whole = ground_picture([floor(), body(ball)], Environment.sky())
     np.testing.assert_array_equal(apart.depth, whole.depth)
     # maps of their own for what moves: edges of shadows lie a texel beside, and the rest is the same
     off = np.abs(apart.image - whole.image).max(axis=-1)

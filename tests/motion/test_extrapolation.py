@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from channels import channel
 
 from fluidlift.motion.extrapolation import (
     harmonic_extension,
@@ -12,18 +13,7 @@ from fluidlift.motion.extrapolation import (
     splat_surface,
     wall_distance,
 )
-from fluidlift.types import CellType, Grid, SurfaceMotion, Terrain, TriangleMesh
-
-
-def channel(nx: int = 20, ny: int = 8, nz: int = 8, depth: int = 5) -> tuple[np.ndarray, Grid]:
-    """A straight channel along x: solid below, air above, in- and outflow at its ends, walls at its sides."""
-    grid = Grid((nx, ny, nz), 0.1)
-    types = np.full(grid.shape, CellType.EMPTY, np.uint8)
-    types[:, :, 0] = CellType.SOLID
-    types[:, :, 1 : depth + 1] = CellType.FLUID
-    types[0, :, 1 : depth + 1] = CellType.INFLOW
-    types[-1, :, 1 : depth + 1] = CellType.OUTFLOW
-    return types, grid
+from fluidlift.types import CellType, SurfaceMotion, Terrain, TriangleMesh
 
 
 def test_samples_go_to_the_nearest_fluid_cell_and_far_ones_nowhere() -> None:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fluidlift.motion.thrown_up import GRAVITY, Flight, with_flights
-from fluidlift.types import CellType, FaceVelocity, Grid
+from fluidlift.motion.thrown_up import Flight, with_flights
+from fluidlift.types import GRAVITY, CellType, FaceVelocity, Grid
 
 FLIGHT = Flight((0.2, 0.0), (0.5, 0.1), 0.4, 2.0, 0.1, 0.8)
 

@@ -4,21 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from channels import channel
 
 from fluidlift.errors import InputRejected
 from fluidlift.motion.volume import DOUBT, VolumeOptions, VolumeSolver, _change, volume_velocity
 from fluidlift.types import CellType, FaceVelocity, Grid, SurfaceMotion
-
-
-def channel(nx: int = 20, ny: int = 8, nz: int = 8, depth: int = 5) -> tuple[np.ndarray, Grid]:
-    """A straight channel along x: solid below, air above, in- and outflow at its ends, walls at its sides."""
-    grid = Grid((nx, ny, nz), 0.1)
-    types = np.full(grid.shape, CellType.EMPTY, np.uint8)
-    types[:, :, 0] = CellType.SOLID
-    types[:, :, 1 : depth + 1] = CellType.FLUID
-    types[0, :, 1 : depth + 1] = CellType.INFLOW
-    types[-1, :, 1 : depth + 1] = CellType.OUTFLOW
-    return types, grid
 
 
 def surface_of(grid: Grid, height: float, velocity: list[float], seen: float = 1.0) -> SurfaceMotion:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from channels import channel
 
 from fluidlift.motion.volume_projection import (
     agreed_limits,
@@ -21,17 +22,6 @@ from fluidlift.motion.volume_projection import (
 )
 from fluidlift.physics.pressure import build_system, divergence, project
 from fluidlift.types import CellType, FaceVelocity, Grid
-
-
-def channel(nx: int = 20, ny: int = 8, nz: int = 8, depth: int = 5) -> tuple[np.ndarray, Grid]:
-    """A straight channel along x: solid below, air above, in- and outflow at its ends, walls at its sides."""
-    grid = Grid((nx, ny, nz), 0.1)
-    types = np.full(grid.shape, CellType.EMPTY, np.uint8)
-    types[:, :, 0] = CellType.SOLID
-    types[:, :, 1 : depth + 1] = CellType.FLUID
-    types[0, :, 1 : depth + 1] = CellType.INFLOW
-    types[-1, :, 1 : depth + 1] = CellType.OUTFLOW
-    return types, grid
 
 
 def test_faces_take_the_fluid_side_at_the_rim() -> None:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from boxes import closed_box
 from numba import config, get_num_threads, set_num_threads
 
 from fluidlift.numerics import multigrid, multigrid_cycle
@@ -11,18 +12,9 @@ from fluidlift.numerics.multigrid_plain import plain_levels, plain_v_cycle
 from fluidlift.numerics.poisson import PoissonSystem, label_components, solve
 
 
-def closed_box(n):
-    weights = []
-    for axis in range(3):
-        w = np.ones(tuple(n + (a == axis) for a in range(3)), np.float32)
-        np.moveaxis(w, axis, 0)[[0, -1]] = 0.0
-        weights.append(w)
-    return weights
-
-
 def open_shares(n, solid_distance):
     """Shares of the faces of the unit box outside a solid, from its signed distance at the face centres."""
-    weights = closed_box(n)
+    weights = closed_box((n, n, n))
     for axis, w in enumerate(weights):
         points = [(np.arange(n) + 0.5) / n] * 3
         points[axis] = np.arange(n + 1) / n
@@ -34,7 +26,7 @@ def open_shares(n, solid_distance):
 def box_with_air(n):
     unknown = np.ones((n, n, n), bool)
     unknown[:, :, int(0.9 * n) :] = False
-    return unknown, closed_box(n)
+    return unknown, closed_box((n, n, n))
 
 
 def pool_round_spheres(n):
@@ -65,7 +57,7 @@ def sparse_spray(n):
     for shift in np.ndindex(2, 2, 2):
         unknown[tuple((corners + shift).T)] = True
     unknown[:, :, : n // 10] = True
-    return unknown, closed_box(n)
+    return unknown, closed_box((n, n, n))
 
 
 def two_closed_chambers(n):

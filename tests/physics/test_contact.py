@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from boxes import walls_of
 
 from fluidlift.errors import InputRejected
-from fluidlift.physics import boundaries
 from fluidlift.physics.contact import REST_GAP, SLACK
 from fluidlift.physics.rigid import RigidBodies, RigidBody, Trajectory
-from fluidlift.types import CellType, Grid, Terrain, TriangleMesh
+from fluidlift.types import CellType
 
 G = 9.81
 H = 0.05
@@ -16,14 +16,7 @@ DT = 0.005
 
 def world(bodies, shape=(20, 20, 20), distance=None, *, gravity=(0.0, 0.0, -G), regions=None):
     """Bodies in a box with an open top; `distance` gives the terrain from the nodes."""
-    grid = Grid(shape, H)
-    nodes = np.full(tuple(n + 1 for n in shape), 100.0) if distance is None else distance(grid.nodes())
-    terrain = Terrain(grid, np.float32(nodes), np.eye(3)[0], TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int)))
-    open_sides = np.zeros((3, 2), bool)
-    open_sides[2, 1] = True
-    regions = np.zeros(shape, np.uint8) if regions is None else regions
-    walls = boundaries.build_walls(terrain, regions, open_sides)
-    return RigidBodies(bodies, walls, density=1000.0, gravity=gravity)
+    return RigidBodies(bodies, walls_of(shape, distance, regions=regions), density=1000.0, gravity=gravity)
 
 
 def run(bodies, duration, record=lambda b: None, dt=DT):

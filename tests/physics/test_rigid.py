@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from boxes import walls_of
 
 from fluidlift.errors import InputRejected
 from fluidlift.numerics.poisson import PoissonSystem
@@ -15,22 +16,12 @@ from fluidlift.physics.forces import add_gravity
 from fluidlift.physics.pressure import build_system, divergence, project
 from fluidlift.physics.rigid import RigidBodies, RigidBody, Trajectory
 from fluidlift.physics.rigid_body import slowed
-from fluidlift.types import CellType, FaceVelocity, Grid, Particles, Terrain, TriangleMesh, matrix_from_quat
+from fluidlift.types import CellType, FaceVelocity, Particles, TriangleMesh, matrix_from_quat
 
 G = 9.81
 H = 0.05
 DENSITY = 1000.0
 TURN = np.array([0.8, 0.3, -0.4, 0.2])
-
-
-def walls_of(shape, distance=None, open_top=True):
-    """A box; `distance` gives the terrain from the nodes."""
-    grid = Grid(shape, H)
-    nodes = np.full(tuple(n + 1 for n in shape), 100.0) if distance is None else distance(grid.nodes())
-    terrain = Terrain(grid, np.float32(nodes), np.eye(3)[0], TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int)))
-    open_sides = np.zeros((3, 2), bool)
-    open_sides[2, 1] = open_top
-    return boundaries.build_walls(terrain, np.zeros(shape, np.uint8), open_sides)
 
 
 def whole(walls):

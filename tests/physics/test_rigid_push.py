@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
+from boxes import walls_of
 
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.physics import boundaries
 from fluidlift.physics.rigid import RigidBodies, RigidBody
-from fluidlift.types import Grid, Terrain, TriangleMesh
 
 H = 0.05
 SHAPE = (20, 20, 20)
@@ -14,12 +13,7 @@ TURN = (0.8, 0.3, -0.4, 0.2)
 
 
 def rigid(bodies, distance=None, open_top=True):
-    grid = Grid(SHAPE, H)
-    nodes = np.full(tuple(n + 1 for n in SHAPE), 100.0) if distance is None else distance(grid.nodes())
-    terrain = Terrain(grid, np.float32(nodes), np.eye(3)[0], TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int)))
-    open_sides = np.zeros((3, 2), bool)
-    open_sides[2, 1] = open_top
-    walls = boundaries.build_walls(terrain, np.zeros(SHAPE, np.uint8), open_sides)
+    walls = walls_of(SHAPE, distance, open_top)
     return RigidBodies(bodies, walls, density=1000.0, gravity=(0, 0, -9.81)), walls
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from channels import WATER, rocky_channel
 
 from fluidlift.physics.pressure import build_system
 from fluidlift.physics.rollout import RolloutParameters, apply_walls, flatten, rollout
@@ -16,10 +17,6 @@ from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid
 H = 0.1
 DOWNSTREAM = np.array([1.0, 0.0, 0.0])
 EXACT = RolloutOptions(tolerance=1e-12)
-WATER = FluidParameters(
-    kinematic_viscosity=3e-3, gravity=(0.8, 0.1, -9.0), inflow_velocity=(1.0, 0.1, 0.0), inflow_fluctuation=0.1,
-    outflow_velocity=0.9, restitution=0.3, wall_damping=0.2, time_step=0.02,
-)  # fmt: skip
 
 
 def diffuse(velocity, domain, p):
@@ -27,18 +24,6 @@ def diffuse(velocity, domain, p):
 
 
 pytestmark = pytest.mark.usefixtures("single_thread")
-
-
-def channel(shape=(9, 6, 5), depth=4):
-    """Bed, two banks, a rock, inflow on the left, outflow on the right, air above."""
-    types = np.full(shape, CellType.EMPTY, np.uint8)
-    types[:, :, :depth] = CellType.FLUID
-    types[:, :, 0] = CellType.SOLID
-    types[:, 0], types[:, -1] = CellType.SOLID, CellType.SOLID
-    types[4, 2:4, :3] = CellType.SOLID
-    types[0][types[0] == CellType.FLUID] = CellType.INFLOW
-    types[-1][types[-1] == CellType.FLUID] = CellType.OUTFLOW
-    return types
 
 
 def domain_of(types, dtype=np.float64, **options):
@@ -69,7 +54,7 @@ def test_a_pool_at_rest_stays_at_rest_under_gravity():
 
 
 def test_a_channel_with_open_ends_accelerates_freely_along_gravity():
-    types = channel()
+    types = rocky_channel()
     types[4, 2:4, 1:3] = CellType.FLUID
     types[0, 1:-1, 1:4] = CellType.OUTFLOW
     domain = domain_of(types)
@@ -81,7 +66,7 @@ def test_a_channel_with_open_ends_accelerates_freely_along_gravity():
 
 
 def test_the_pressure_operator_is_minus_divergence_of_gradient():
-    domain = domain_of(channel())
+    domain = domain_of(rocky_channel())
     rng = np.random.default_rng(2)
     q = np.where(domain.system.unknown, rng.standard_normal(domain.shape), 0.0)
     product = -(domain.divergence.matrix @ (domain.gradient.matrix @ q.ravel())).reshape(domain.shape)
@@ -107,7 +92,7 @@ def test_a_sloping_surface_along_gravity_stays_nearly_at_rest():
 
 
 def test_density_does_not_move_the_fluid_and_scales_the_pressure():
-    domain = domain_of(channel(), mainstream=DOWNSTREAM)
+    domain = domain_of(rocky_channel(), mainstream=DOWNSTREAM)
     start = random_start(domain)
     light, heavy = parameters_of(replace(WATER, density=1.2)), parameters_of(replace(WATER, density=1200.0))
     a, b = (rollout(start, domain, p, steps=2, options=EXACT) for p in (light, heavy))
@@ -116,7 +101,7 @@ def test_density_does_not_move_the_fluid_and_scales_the_pressure():
 
 
 def test_a_rollout_is_free_of_divergence_and_leaves_walls_closed():
-    domain = domain_of(channel(), mainstream=DOWNSTREAM)
+    domain = domain_of(rocky_channel(), mainstream=DOWNSTREAM)
     result = rollout(random_start(domain), domain, parameters_of(WATER), steps=3, options=EXACT)
     divergence = domain.divergence.matrix @ result.velocity.numpy()
     # the weights are single precision: 6e-8 of pressure corrections of some m/s over cells of 0.1 m
@@ -159,7 +144,7 @@ def test_viscosity_keeps_momentum_and_damps_a_shear_wave_at_the_discrete_rate():
 
 
 def test_full_wall_damping_and_viscosity_bring_wall_cells_towards_rest():
-    domain = domain_of(channel())
+    domain = domain_of(rocky_channel())
     start = random_start(domain)
     free = apply_walls(start, domain, parameters_of(replace(WATER, wall_damping=0.0, restitution=0.0)))
     assert torch.equal(free, start)
@@ -186,7 +171,7 @@ def test_buoyancy_lifts_smoke_and_drives_air_around_it():
 
 @pytest.mark.parametrize("step_of", ["viscosity", "walls", "projection"])
 def test_each_term_passes_the_float64_gradcheck(step_of):
-    domain = domain_of(channel((6, 5, 5)), mainstream=DOWNSTREAM)
+    domain = domain_of(rocky_channel((6, 5, 5)), mainstream=DOWNSTREAM)
     start = random_start(domain).requires_grad_()
     nu = torch.tensor(2e-2, dtype=torch.float64, requires_grad=True)
     damping = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
@@ -208,7 +193,7 @@ def test_each_term_passes_the_float64_gradcheck(step_of):
 
 @pytest.mark.parametrize("projection", ["implicit", "jacobi"])
 def test_the_projection_gradient_is_that_of_finite_differences_at_its_working_tolerance(projection):
-    domain = domain_of(channel(), mainstream=DOWNSTREAM)
+    domain = domain_of(rocky_channel(), mainstream=DOWNSTREAM)
     rng = np.random.default_rng(3)
     start, direction, weights = (torch.tensor(rng.standard_normal(domain.offsets[3])) for _ in range(3))
     working = RolloutOptions(projection=projection, sweeps=30, tolerance=1e-5)
@@ -234,7 +219,7 @@ def loss_of_rollout(values, domain, start, pattern, options, steps=4):
 @pytest.mark.parametrize("length", [4, 25])
 def test_taylor_remainder_of_a_rollout_falls_with_the_square_of_the_step(length):
     """f(x + e d) - f(x) - e f'(x) d is second order in e where the gradient is right, first order where it is not."""
-    domain = domain_of(channel(), mainstream=DOWNSTREAM)
+    domain = domain_of(rocky_channel(), mainstream=DOWNSTREAM)
     # smooth start: kinks of the back-trace and of the walls are then not crossed by small steps
     start = rollout(random_start(domain, 0.2), domain, parameters_of(WATER), steps=3, options=EXACT).velocity
     rng = np.random.default_rng(7)
@@ -260,7 +245,7 @@ def test_taylor_remainder_of_a_rollout_falls_with_the_square_of_the_step(length)
 def test_gradient_of_the_inflow_against_finite_differences_with_each_advection_gradient(gradient):
     """The paper's surrogate misses part of the derivative: on this four-step rollout (Courant number 0.2) it is off by
     less than 10 %, the exact one by less than 1e-4 (second order of the difference)."""
-    domain = domain_of(channel(), mainstream=DOWNSTREAM)
+    domain = domain_of(rocky_channel(), mainstream=DOWNSTREAM)
     start = rollout(random_start(domain, 0.2), domain, parameters_of(WATER), steps=3, options=EXACT).velocity
     options = replace(EXACT, advection_gradient=gradient)
     speed = parameters_of(WATER).inflow_velocity.clone().requires_grad_()
@@ -276,7 +261,7 @@ def test_gradient_of_the_inflow_against_finite_differences_with_each_advection_g
 
 
 def test_first_guesses_change_nothing_but_the_work():
-    domain = domain_of(channel(), dtype=np.float32, mainstream=DOWNSTREAM)
+    domain = domain_of(rocky_channel(), dtype=np.float32, mainstream=DOWNSTREAM)
     start = FaceVelocity(*(np.full(s, 0.5, np.float32) for s in domain.face_shapes))
     physical = RolloutParameters.of(WATER)
     cold = rollout(start, domain, physical, steps=3)
@@ -288,7 +273,7 @@ def test_first_guesses_change_nothing_but_the_work():
 
 @pytest.mark.parametrize(("steps", "every"), [(7, 1), (7, 3), (25, 5), (100, 10)])
 def test_checkpoints_change_no_bit_of_the_gradient(steps, every):
-    domain = domain_of(channel(), dtype=np.float32, mainstream=DOWNSTREAM)
+    domain = domain_of(rocky_channel(), dtype=np.float32, mainstream=DOWNSTREAM)
     rng = np.random.default_rng(5)
     pattern = torch.tensor(rng.standard_normal(domain.offsets[3]).astype(np.float32))
     results = []
@@ -308,7 +293,7 @@ def test_checkpoints_change_no_bit_of_the_gradient(steps, every):
 
 
 def test_counts_that_do_not_match_are_refused():
-    domain = domain_of(channel())
+    domain = domain_of(rocky_channel())
     flat = torch.zeros(domain.offsets[3], dtype=torch.float64)
     with pytest.raises(ValueError, match="2 domains for 3 steps"):
         rollout(flat, [domain, domain], parameters_of(WATER), steps=3)

@@ -8,6 +8,7 @@ import numba
 import numpy as np
 import pytest
 import torch
+from channels import WATER, rocky_channel
 from scipy.sparse import diags, identity
 from scipy.sparse.linalg import spsolve
 
@@ -23,28 +24,17 @@ from fluidlift.physics.rollout import (
 from fluidlift.physics.rollout_domain import prepare_domain
 from fluidlift.physics.rollout_operators import apply_linear, implicit_diffusion, set_outflow, subtract_gradient
 from fluidlift.physics.rollout_pressure import RolloutOptions, project
-from fluidlift.types import CellType, FluidParameters, Grid
+from fluidlift.types import CellType, Grid
 
 H = 0.1
 EXACT = RolloutOptions(tolerance=1e-13)
-WATER = FluidParameters(
-    kinematic_viscosity=3e-3, gravity=(0.8, 0.1, -9.0), inflow_velocity=(1.0, 0.1, 0.0), inflow_fluctuation=0.1,
-    outflow_velocity=0.9, restitution=0.3, wall_damping=0.2, time_step=0.02,
-)  # fmt: skip
 
 
 pytestmark = pytest.mark.usefixtures("single_thread")
 
 
 def channel(dtype=np.float64):
-    """Bed, two banks, a rock, inflow on the left, outflow on the right, air above."""
-    types = np.full((8, 6, 6), CellType.EMPTY, np.uint8)
-    types[:, :, :4] = CellType.FLUID
-    types[:, :, 0] = CellType.SOLID
-    types[:, 0], types[:, -1] = CellType.SOLID, CellType.SOLID
-    types[4, 2:4, :3] = CellType.SOLID
-    types[0][types[0] == CellType.FLUID] = CellType.INFLOW
-    types[-1][types[-1] == CellType.FLUID] = CellType.OUTFLOW
+    types = rocky_channel((8, 6, 6))
     system = build_system(types, None, Grid(types.shape, H))
     return prepare_domain(types, system, mainstream=np.array([1.0, 0.0, 0.0]), dtype=dtype)
 

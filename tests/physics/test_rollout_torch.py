@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from channels import WATER, rocky_channel
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from fluidlift.numerics import torch_multigrid
@@ -32,31 +33,20 @@ from fluidlift.physics.rollout_torch_domain import (
     flux_balance,
     neighbour_sum,
 )
-from fluidlift.types import CellType, FluidParameters, Grid
+from fluidlift.types import CellType, Grid
 
 CUDA = pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device"))
 DEVICES = ["cpu", CUDA]
 H = 0.1
 DOWNSTREAM = np.array([1.0, 0.0, 0.0])
 EXACT = RolloutOptions(tolerance=1e-12)
-WATER = FluidParameters(
-    kinematic_viscosity=3e-3, gravity=(0.8, 0.1, -9.0), inflow_velocity=(1.0, 0.1, 0.0), inflow_fluctuation=0.1,
-    outflow_velocity=0.9, restitution=0.3, wall_damping=0.2, time_step=0.02,
-)  # fmt: skip
 
 
 pytestmark = pytest.mark.usefixtures("single_thread")
 
 
 def river(shape=(9, 6, 5), depth=4, dtype=np.float64):
-    """Bed, two banks, a rock, inflow on the left, outflow on the right, air above."""
-    types = np.full(shape, CellType.EMPTY, np.uint8)
-    types[:, :, :depth] = CellType.FLUID
-    types[:, :, 0] = CellType.SOLID
-    types[:, 0], types[:, -1] = CellType.SOLID, CellType.SOLID
-    types[4, 2:4, :3] = CellType.SOLID
-    types[0][types[0] == CellType.FLUID] = CellType.INFLOW
-    types[-1][types[-1] == CellType.FLUID] = CellType.OUTFLOW
+    types = rocky_channel(shape, depth)
     return prepare_domain(types, build_system(types, None, Grid(shape, H)), mainstream=DOWNSTREAM, dtype=dtype)
 
 

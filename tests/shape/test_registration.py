@@ -8,7 +8,6 @@ import pytest
 from fluidlift.shape.heights import PlaneHeight
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.registration import (
-    STANDARD_GRAVITY,
     PlacedHeight,
     VelocityEvidence,
     fit_free_fall,
@@ -16,7 +15,7 @@ from fluidlift.shape.registration import (
     place,
     pose_up,
 )
-from fluidlift.types import PinholeCamera, RigidTransform, UpEvidence
+from fluidlift.types import GRAVITY, PinholeCamera, RigidTransform, UpEvidence
 
 RNG = np.random.default_rng(0)
 CANONICAL = level_camera(PinholeCamera.from_fov(50.0, (160, 100)), UpEvidence(30.0, 0.0, "", 1.0))
@@ -66,7 +65,7 @@ def test_what_falls_with_g_units_shows_how_long_a_metre_is(g, kind):
     scale = metric_scale(kind, *falling(g))
     assert scale.source == "free fall" and not scale.warning
     # medians of v^2 over twelve layers of height are nearly exact: v^2 is linear in height
-    assert scale.value == pytest.approx(STANDARD_GRAVITY / g, rel=0.02)
+    assert scale.value == pytest.approx(GRAVITY / g, rel=0.02)
 
 
 def test_noise_on_the_speed_hardly_moves_the_free_fall():
@@ -97,13 +96,13 @@ def filmed_fall(size, *, seed=0, outliers=0.15, noise=0.1, law=None):
     rng, n, start = np.random.default_rng(seed), 3000, 0.7 * np.sqrt(size)
     interval = 0.012 * np.sqrt(size)  # a share of the whole fall
     drop = rng.uniform(0, 0.6 * size, n)
-    time = (-start + np.sqrt(start**2 + 2 * STANDARD_GRAVITY * drop)) / STANDARD_GRAVITY
+    time = (-start + np.sqrt(start**2 + 2 * GRAVITY * drop)) / GRAVITY
     across = 0.03 * size * rng.uniform(-1, 1, n)
 
     def at(t):
-        fallen = start * t + 0.5 * STANDARD_GRAVITY * t**2
+        fallen = start * t + 0.5 * GRAVITY * t**2
         if law is not None:
-            fallen = drop + (t - time) * law(drop / size) * np.sqrt(STANDARD_GRAVITY * size)
+            fallen = drop + (t - time) * law(drop / size) * np.sqrt(GRAVITY * size)
         return np.stack([across + 0.3 * start * t, np.full(n, size), 0.3 * size - fallen], axis=1) / size
 
     camera = level_camera(PinholeCamera.from_fov(50.0, (512, 512)), UpEvidence(8.0, 0.0, "", 1.0))
@@ -136,8 +135,8 @@ def test_the_standard_error_of_a_fall_is_the_scatter_over_repetitions():
     value, error = (np.array([getattr(f, n) for f in falls]) for n in ("acceleration", "standard_error"))
     # the deviation of 24 numbers is known to 15 %, and each error, from twelve bands, to 20 %
     assert np.std(value) == pytest.approx(np.median(error), rel=0.4)
-    assert value.mean() == pytest.approx(STANDARD_GRAVITY, rel=0.004)  # three errors of the mean
-    assert (np.abs(value - STANDARD_GRAVITY) < 1.96 * error).mean() > 0.8  # 19 of 20, less two deviations of 24 throws
+    assert value.mean() == pytest.approx(GRAVITY, rel=0.004)  # three errors of the mean
+    assert (np.abs(value - GRAVITY) < 1.96 * error).mean() > 0.8  # 19 of 20, less two deviations of 24 throws
 
 
 def test_a_frame_between_two_pictures_is_no_lag():
@@ -145,7 +144,7 @@ def test_a_frame_between_two_pictures_is_no_lag():
     points, velocities, interval = filmed_fall(1.0, noise=0.0, outliers=0.0)
     at_middle = fit_free_fall(points, velocities, seen=VelocityEvidence(interval=interval))
     # straight bands through a law that is exact
-    assert at_middle.acceleration == pytest.approx(STANDARD_GRAVITY, rel=1e-3)
+    assert at_middle.acceleration == pytest.approx(GRAVITY, rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,8 @@ import pytest
 
 from fluidlift.shape.kind import estimate_kind, thrown_up
 from fluidlift.shape.thrown import Thrown, thrown
-from fluidlift.synthetic.fountain import GRAVITY, SCENES, AirborneScene, Source, filmed_airborne
+from fluidlift.synthetic.fountain import SCENES, AirborneScene, Source, filmed_airborne
+from fluidlift.types import GRAVITY
 
 UP = float(np.sqrt(2 * GRAVITY * 2.0))
 OTHERS = {

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scipy import ndimage
 
 from fluidlift.physics.rollout import flatten
@@ -13,14 +12,7 @@ from fluidlift.types import CellType
 
 NAMES = sorted(PLANS)
 
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Small arrays: torch's threads cost more than they save."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("single_thread")
 
 
 @pytest.fixture(scope="module")

@@ -2,24 +2,15 @@
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 import pytest
 
 from fluidlift.physics.rigid import RigidBody, Trajectory
 from fluidlift.synthetic import tanks
 from fluidlift.synthetic.gauges import Gauge
+from fluidlift.types import GRAVITY as G
 
-G = tanks.GRAVITY
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """On grids of a few thousand cells starting threads costs more than the work; results do not depend on it."""
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    yield
-    numba.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("single_thread")
 
 
 def level(gauge: Gauge, simulator, beyond: float) -> float:

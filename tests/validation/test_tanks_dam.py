@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import pytest
 
 from fluidlift.synthetic import tanks
 from fluidlift.synthetic.gauges import Gauge
+from fluidlift.types import GRAVITY
 
 FRONT = np.array([
     (0.41, 1.11), (0.84, 1.22), (1.19, 1.44), (1.43, 1.67), (1.63, 1.89), (1.83, 2.11), (1.98, 2.33), (2.20, 2.56),
@@ -25,14 +25,7 @@ HEIGHT = np.array([
 ])  # fmt: skip
 """t sqrt(g / a) and height of the column at the wall over its first one; the same paper, table 6."""
 
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """On grids of a few thousand cells starting threads costs more than the work; results do not depend on it."""
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    yield
-    numba.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("single_thread")
 
 
 @dataclass(frozen=True)
@@ -60,7 +53,7 @@ def collapse(
 ) -> Collapse:
     tank = tanks.dam_break(cells=cells, aspect=aspect, length=length, width_cells=3)
     gauge, simulator = Gauge.of(tank), tank.simulator()
-    unit = tank.size * np.sqrt(0.5 / (tanks.GRAVITY * tank.size))
+    unit = tank.size * np.sqrt(0.5 / (GRAVITY * tank.size))
     times = np.arange(0.0, until + 0.5 * step, step)
     depths, fronts = [], []
     for t in times:
@@ -113,7 +106,7 @@ def test_a_long_dam_break_has_the_profile_of_ritter():
     tank = tanks.dam_break(cells=60, aspect=1 / 6, length=2.0, width_cells=2)
     depth = tank.size / 6
     gauge, simulator = Gauge.of(tank), tank.simulator()
-    celerity = np.sqrt(tanks.GRAVITY * depth)
+    celerity = np.sqrt(GRAVITY * depth)
     time = 3.5 * depth / celerity
     simulator.advance(time)
     found = gauge.depth(simulator.particles).mean(axis=1) / depth

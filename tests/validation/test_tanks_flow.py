@@ -1,6 +1,5 @@
 """Flow through and past things: channels, inlets, walls, a spinning bucket."""
 
-import numba
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -11,19 +10,12 @@ from fluidlift.physics.apic import LiquidSimulator, SimulationSettings
 from fluidlift.physics.boundaries import face_fractions
 from fluidlift.synthetic import filling, tanks
 from fluidlift.synthetic.gauges import Gauge
+from fluidlift.types import GRAVITY as G
 from fluidlift.types import CellType, FluidParameters, Grid, Particles
 
-G = tanks.GRAVITY
 H = 0.1
 
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """On grids of a few thousand cells starting threads costs more than the work; results do not depend on it."""
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    yield
-    numba.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("single_thread")
 
 
 def test_a_minute_of_channel_flow_loses_no_water():
@@ -130,7 +122,7 @@ def test_the_velocity_that_moves_the_particles_has_no_divergence(name, monkeypat
         "drop": lambda: tanks.drop(cells=20),
     }[name]()
     simulator = tank.simulator()
-    simulator.advance(0.3 * tank.time_scale)
+    simulator.advance(0.3 * np.sqrt(tank.size / G))
     seen = []
     real = apic.transfer.grid_to_particles
 

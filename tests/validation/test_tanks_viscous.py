@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 import pytest
 
@@ -11,18 +10,10 @@ from fluidlift.physics.apic import LiquidSimulator
 from fluidlift.synthetic import filling, tanks
 from fluidlift.synthetic.analytic import film_speed, on_faces, tilted_channel
 from fluidlift.synthetic.gauges import Gauge
+from fluidlift.types import GRAVITY as G
 from fluidlift.types import CellType, FluidParameters, Grid, Particles
 
-G = tanks.GRAVITY
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """On grids of a few thousand cells starting threads costs more than the work; results do not depend on it."""
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    yield
-    numba.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("single_thread")
 
 
 def simulator_of(grid, positions, *, velocities=None, terrain=None, **parameters):

@@ -98,7 +98,6 @@ def align_view(
     mask: Bool[np.ndarray, "h w"],
     *,
     field_of_view: float | None = None,
-    seed: int = 0,
 ) -> Aligned:
     """The camera of a picture in which an upright body (z up) is the masked thing.
 
@@ -108,7 +107,6 @@ def align_view(
         mask: where it shows the body.
         field_of_view: degrees across the longer side of the picture; None: 50 to start with, then fitted (loosely: a
             single view hardly tells it from the distance).
-        seed: of the choice of the Gaussians that are drawn in the search.
 
     Raises:
         InputRejected: no fluid in the picture.
@@ -121,8 +119,7 @@ def align_view(
     middle = np.average(body.means.astype(np.float64), axis=0, weights=body.opacities.astype(np.float64) + 1e-9)
 
     stages = [
-        _Comparison.of(_thinned(body, n, seed), middle, image, mask, width)
-        for n, width in zip(_COUNTS, _SIZES, strict=True)
+        _Comparison.of(_thinned(body, n), middle, image, mask, width) for n, width in zip(_COUNTS, _SIZES, strict=True)
     ]
     found = sorted((stages[0].loss(pose), i, pose) for i, pose in enumerate(_directions(stages[0], focal)))
     if not found or not math.isfinite(found[0][0]):
@@ -286,7 +283,7 @@ def _apart(a: _Pose, b: _Pose) -> float:
     return math.acos(float(np.clip(back(a) @ back(b), -1.0, 1.0)))
 
 
-def _thinned(body: Gaussians, count: int, seed: int) -> Gaussians:
+def _thinned(body: Gaussians, count: int) -> Gaussians:
     """At most `count` of the Gaussians, as much wider as closes the gaps that the others leave.
 
     That is no more than what keeps the area covered, and no more than up to the nearest neighbour: bodies whose
@@ -295,7 +292,7 @@ def _thinned(body: Gaussians, count: int, seed: int) -> Gaussians:
     seen = body.select(body.opacities > 0.02)
     if len(seen) <= count:
         return seen
-    pick = seen.select(np.sort(np.random.default_rng(seed).choice(len(seen), count, replace=False)))
+    pick = seen.select(np.sort(np.random.default_rng(0).choice(len(seen), count, replace=False)))
     spacing = np.median(nearest(pick.means, pick.means, 2)[0][:, 1])
     width = max(float(np.median(pick.scales.max(axis=1))), 1e-12)
     wider = float(np.clip(spacing / width, 1.0, math.sqrt(len(seen) / count)))

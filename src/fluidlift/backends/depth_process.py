@@ -21,7 +21,7 @@ import numpy as np
 
 from fluidlift.backends.depth_model import DepthModel, Guess
 from fluidlift.backends.depth_pictures import require_answer, require_picture
-from fluidlift.backends.generator_process import PACKAGE, end_group, out_of_memory
+from fluidlift.backends.generator_process import PACKAGE, end_group, foreign_environment, out_of_memory
 from fluidlift.backends.registry import ModelChoice
 from fluidlift.errors import FluidliftError, InputRejected, MissingPackage
 from fluidlift.types import PinholeCamera
@@ -32,8 +32,6 @@ MOST_LINE = 2**16
 """bytes of the line of a message"""
 LAST_BYTES, LAST_LINES = 2**14, 8
 """of what a process that broke down has printed, which are shown"""
-_OURS = ("PYTHONHOME", "VIRTUAL_ENV", "PYTHONSTARTUP", "LD_PRELOAD")
-"""environment variables that are about our own Python"""
 _HOLDS = ("metres", "relative", "disparity")
 _WIDEST = 180.0
 
@@ -93,7 +91,7 @@ class DepthProcess(DepthModel):
         return Guess(values, holds, None if view is None else float(view), normals)
 
     def _started(self, choice: ModelChoice) -> subprocess.Popen:
-        environment = {k: v for k, v in os.environ.items() if k not in _OURS} | {"PYTHONUNBUFFERED": "1"}
+        environment = foreign_environment() | {"PYTHONUNBUFFERED": "1"}
         if not choice.allow_download:
             environment |= {"HF_HUB_OFFLINE": "1", "TRANSFORMERS_OFFLINE": "1"}
         try:

@@ -205,11 +205,14 @@ class GeneratorProcess(Generator):
         return read_body(folder, picture, self.card.title)
 
 
+def foreign_environment() -> dict[str, str]:
+    """Ours for another Python: without what is about our own."""
+    return {k: v for k, v in os.environ.items() if k not in _OURS}
+
+
 def environment(card: GeneratorCard, choice: ProcessChoice) -> dict[str, str]:
     """Ours without what is about our own Python, with what the generator needs; PYTHONPATH is the user's doing."""
-    found = {k: v for k, v in os.environ.items() if k not in _OURS}
-    found |= dict(card.environment)
-    found["PYTHONUNBUFFERED"] = "1"
+    found = foreign_environment() | dict(card.environment) | {"PYTHONUNBUFFERED": "1"}
     found |= _code_first(choice.code)
     if not choice.allow_download:
         found |= {"HF_HUB_OFFLINE": "1", "TRANSFORMERS_OFFLINE": "1"}
@@ -348,18 +351,17 @@ def _said(log: Path) -> str:
     return "Its last lines:\n  " + text.replace("\n", "\n  ") if text else "It said nothing."
 
 
-def checked_elsewhere(python: Path, code: Path | None, packages: Iterable[str], seconds: float = 120.0) -> dict:
+def checked_elsewhere(python: Path, code: Path | None, packages: Iterable[str]) -> dict:
     """What `generator_runner --check` finds in another Python: python, missing, gpu, no_gpu.
 
     Raises:
         MissingPackage: that Python does not start or does not answer.
     """
-    card_env = {k: v for k, v in os.environ.items() if k not in _OURS}
-    card_env |= _code_first(code)
+    card_env = foreign_environment() | _code_first(code)
     command = [str(python), str(RUNNER), "--check", str(PACKAGE), *packages]
     try:
         done = subprocess.run(
-            command, env=card_env, stdin=subprocess.DEVNULL, capture_output=True, timeout=seconds, check=False
+            command, env=card_env, stdin=subprocess.DEVNULL, capture_output=True, timeout=120.0, check=False
         )
         found = json.loads(done.stdout.decode("utf-8", "replace").strip().splitlines()[-1])
         return {k: found[k] for k in ("python", "missing", "gpu", "no_gpu")}

@@ -85,14 +85,12 @@ def preprocess(image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"])
     return Prepared(seen[..., :3] * alpha[..., None] + (1.0 - alpha[..., None]), cut.after(first), alpha)
 
 
-def seen_camera(crop: Crop, distance: float = DISTANCE) -> PinholeCamera:
+def seen_camera(crop: Crop) -> PinholeCamera:
     """The camera of the cut-out: on the x axis, looking along -x, y to the right, z up."""
-    return square_camera(crop, FOV, np.array([distance, 0.0, 0.0]))
+    return square_camera(crop, FOV, np.array([DISTANCE, 0.0, 0.0]))
 
 
-def to_canonical(
-    raw: Mapping[str, Any], crop: Crop, size: tuple[int, int], distance: float = DISTANCE
-) -> tuple[Gaussians, PinholeCamera]:
+def to_canonical(raw: Mapping[str, Any], crop: Crop, size: tuple[int, int]) -> tuple[Gaussians, PinholeCamera]:
     """Body and camera of the original picture.
 
     Args:
@@ -100,18 +98,17 @@ def to_canonical(
             its `GaussianModel`.
         crop: of `preprocess`.
         size: of the original picture, px.
-        distance: of the camera, as the model was told it.
     """
     xyz = array(raw["xyz"])
     n = len(xyz)
     shs = array(raw["shs"]).reshape(n, -1, 3)
     g = Gaussians(xyz, array(raw["rotation"]), array(raw["scaling"]), array(raw["opacity"]).reshape(n), shs)
-    return g, crop.camera(seen_camera(crop, distance), size)
+    return g, crop.camera(seen_camera(crop), size)
 
 
-def batch_of(prepared: Prepared, distance: float = DISTANCE) -> dict[str, Float[np.ndarray, "..."]]:
+def batch_of(prepared: Prepared) -> dict[str, Float[np.ndarray, "..."]]:
     """What its `_forward` takes, as arrays with the axes of batch and view in front."""
-    camera = seen_camera(prepared.crop, distance)
+    camera = seen_camera(prepared.crop)
     (fx, fy), (cx, cy), (w, h) = camera.focal, camera.center, camera.size
     pose = np.eye(4, dtype=np.float32)
     pose[:3, :3], pose[:3, 3] = camera.camera_from_world.rotation.T, camera.position

@@ -46,26 +46,24 @@ def end_point_percentile(
     flow: Float[np.ndarray, "*t h w 2"],
     truth: Float[np.ndarray, "*t h w 2"],
     mask: Bool[np.ndarray, "*t h w"],
-    percent: float = 90.0,
 ) -> float | None:
-    """The length (px/frame) that so many per cent of the differences stay below; None where the mask is empty."""
+    """The length (px/frame) that nine tenths of the differences stay below; None where the mask is empty."""
     require(flow.shape == truth.shape, f"flow {flow.shape}", str(truth.shape))
     if not mask.any():
         return None
-    return float(np.percentile(np.linalg.norm(flow[mask].astype(np.float64) - truth[mask], axis=-1), percent))
+    return float(np.percentile(np.linalg.norm(flow[mask].astype(np.float64) - truth[mask], axis=-1), 90.0))
 
 
 def mean_cosine(
     flow: Float[np.ndarray, "*t h w 2"],
     truth: Float[np.ndarray, "*t h w 2"],
     mask: Bool[np.ndarray, "*t h w"],
-    slowest: float = MOVING_PX,
 ) -> float | None:
-    """Mean cosine of the angle between two fields where the truth is faster than `slowest`; a zero vector scores 0."""
+    """Mean cosine of the angle between two fields where the truth exceeds `MOVING_PX`; a zero vector scores 0."""
     require(flow.shape == truth.shape, f"flow {flow.shape}", str(truth.shape))
     a, b = flow[mask].astype(np.float64), truth[mask].astype(np.float64)
     speed = np.linalg.norm(b, axis=-1)
-    a, b, speed = a[speed > slowest], b[speed > slowest], speed[speed > slowest]
+    a, b, speed = a[speed > MOVING_PX], b[speed > MOVING_PX], speed[speed > MOVING_PX]
     if len(a) == 0:
         return None
     length = np.linalg.norm(a, axis=-1)

@@ -76,7 +76,7 @@ def _scored_pixels(arrays: Arrays, case: Case, start: int, n: int, size: tuple[i
     return mask
 
 
-def score_flow(arrays: Arrays, case: Case, rows: tuple[int, int] | None = None) -> list[Metric]:
+def score_flow(arrays: Arrays, case: Case) -> list[Metric]:
     """End-point error (mean, 90th percentile) and cosine of the raw, the completed and the re-simulated velocity.
 
     Raw and completed flow are scored where truth and run both say fluid (segmentation is scored by itself),
@@ -86,7 +86,6 @@ def score_flow(arrays: Arrays, case: Case, rows: tuple[int, int] | None = None) 
     Args:
         arrays: of the run.
         case: the truth.
-        rows: only these picture rows [first, last) of the truth.
     """
     out = []
     first = number(arrays, "first_frame", 0)
@@ -107,9 +106,6 @@ def score_flow(arrays: Arrays, case: Case, rows: tuple[int, int] | None = None) 
         shown, _ = picked(arrays, "resim_mask", 3)
         if name == "resim_flow":
             mask = fluid if shown is None or len(shown) < n else fluid & resample_nearest(shown[:n].astype(bool), size)
-        if rows is not None:
-            keep = resample_nearest(np.isin(np.arange(case.size[1]), np.arange(*rows))[:, None], (1, size[1]))
-            mask, fluid = mask & keep, fluid & keep
         finite = np.isfinite(flow[:n]).all(-1)
         mask = mask & finite
         truth = truth_flow(case, slice(start, start + n), size)

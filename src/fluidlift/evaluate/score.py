@@ -61,7 +61,6 @@ def evaluate_arrays(
     case: Case,
     *,
     video: np.ndarray | None = None,
-    rows: tuple[int, int] | None = None,
 ) -> Evaluation:
     """All figures of an asset and the arrays of its run. A figure that cannot be measured is None and says why.
 
@@ -75,10 +74,9 @@ def evaluate_arrays(
         manifest: timings and peak memory.
         case: the truth.
         video: u8 [T,H,W,3], the clip of the case on the raster of resim_frames.
-        rows: score the flow only on these picture rows [first, last) of the truth.
     """
     segmentation, series = score_segmentation(arrays, case)
-    flow = score_flow(arrays, case, rows)
+    flow = score_flow(arrays, case)
     depth, scale, frame = score_depth(arrays, case)
     if scale is None:
         why = "no scale: " + depth[0].note
@@ -109,13 +107,12 @@ def read_video(path: Path, size: tuple[int, int]) -> np.ndarray:
     return np.stack([cv2.resize(f, size, interpolation=way) for f in frames])
 
 
-def evaluate_asset(folder: Path, truth: Path, *, rows: tuple[int, int] | None = None) -> Evaluation:
+def evaluate_asset(folder: Path, truth: Path) -> Evaluation:
     """Score an asset folder against a case folder.
 
     Args:
         folder: the asset; its folder `work` holds the arrays of the run (`arrays_of_run`).
         truth: the case; see `read_case`.
-        rows: score the flow only on these picture rows [first, last) of the truth.
 
     Raises:
         InputRejected: the asset or the case cannot be read. A missing folder `work` only leaves figures out.
@@ -134,4 +131,4 @@ def evaluate_asset(folder: Path, truth: Path, *, rows: tuple[int, int] | None = 
             video = read_video(case.video, (frames.shape[2], frames.shape[1]))
         except FluidliftError:
             video = None  # the pictures are then not scored, and the figure says so
-    return evaluate_arrays(asset, arrays, manifest, case, video=video, rows=rows)
+    return evaluate_arrays(asset, arrays, manifest, case, video=video)

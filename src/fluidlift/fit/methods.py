@@ -49,13 +49,13 @@ class _Objective:
         away = (there.raw - self.space.prior_raw) / self.space.prior_sigma
         return 0.5 * self.scale * there.loss + 0.5 * float(np.square(away).sum())
 
-    def step(self, slopes: Jacobian, at: np.ndarray, damping: float, longest: float) -> tuple[np.ndarray, float]:
-        """The damped Gauss-Newton step, and the gain it predicts."""
+    def step(self, slopes: Jacobian, at: np.ndarray, damping: float) -> tuple[np.ndarray, float]:
+        """The damped Gauss-Newton step, of two prior widths at most, and the gain it predicts."""
         width = self.space.prior_sigma
         hessian = self.scale * slopes.normal + np.diag(1 / width**2)
         gradient = self.scale * slopes.slope + (at - self.space.prior_raw) / width**2
         step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
-        step *= min(1.0, longest / max(float(np.abs(step / width).max()), 1e-12))
+        step *= min(1.0, 2.0 / max(float(np.abs(step / width).max()), 1e-12))
         return step, -float(step @ gradient + 0.5 * step @ hessian @ step)
 
 
@@ -71,14 +71,12 @@ class _Search:
     small: bool = False
     """the last step gained little or was short"""
 
-    def advance(
-        self, problem: FitProblem, objective: _Objective, budget: Budget, *, longest: float, enough: float
-    ) -> bool:
+    def advance(self, problem: FitProblem, objective: _Objective, budget: Budget, *, enough: float) -> bool:
         """One step to a better point; False where damping finds none."""
         width, before = objective.space.prior_sigma, objective.value(self.here)
         assert self.slopes is not None
         while self.damping < 1e6 and not budget.spent:
-            step, predicted = objective.step(self.slopes, self.here.raw, self.damping, longest)
+            step, predicted = objective.step(self.slopes, self.here.raw, self.damping)
             there = evaluate(problem, objective.space, self.here.raw + step, budget, self.here.guesses)
             gain = before - objective.value(there)
             short = float(np.abs(step / width).max()) < 0.01
@@ -127,7 +125,6 @@ def levenberg_marquardt(
     budget: Budget,
     *,
     max_iterations: int = 20,
-    longest: float = 2.0,
     explore: bool = True,
 ) -> Minimum:
     """Minimise N / (2 L) sum r^2 + prior / 2.
@@ -142,7 +139,6 @@ def levenberg_marquardt(
     objective, a log probability, or where damping finds no better point.
 
     Args:
-        longest: longest step, in prior widths.
         explore: False begins with the second phase.
     """
     search = _Search(evaluate(problem, space, start, budget))
@@ -165,7 +161,7 @@ def levenberg_marquardt(
         elif exploring:
             scale = EXPLORING_OBSERVATIONS / noise_level(search.here.loss)
         objective, before = _Objective(space, scale), search.here
-        found = search.advance(problem, objective, budget, longest=longest, enough=0.5 if exploring else 0.01)
+        found = search.advance(problem, objective, budget, enough=0.5 if exploring else 0.01)
         if search.here is not before:
             history.append(search.here.loss)
         budget.tell()

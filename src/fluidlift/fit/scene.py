@@ -96,7 +96,6 @@ def build_scene(
     kind: str | FluidKind,
     mainstream: np.ndarray | None = None,
     observed: Sequence[np.ndarray | None] | None = None,
-    sweeps: int = 5,
     firsts: Sequence[int] = (0,),
 ) -> FitScene:
     """Layouts, operators and scales of the targets.
@@ -127,7 +126,7 @@ def build_scene(
         types = np.ascontiguousarray(types, np.uint8)
         key = types.tobytes()
         if key not in known:
-            known[key] = _layout(types, system_or_terrain, grid, kind, along, sweeps)
+            known[key] = _layout(types, system_or_terrain, grid, kind, along)
         domains.append(known[key])
     seen = [seen_faces(d, np.asarray(c), v) for d, c, v in zip(domains, cell_types, views)]
     flat = [np.where(s, flatten(t, torch.float64).numpy(), 0.0) for t, s in zip(targets, seen)]
@@ -148,7 +147,6 @@ def _layout(
     grid: Grid,
     kind: FluidKind,
     mainstream: np.ndarray,
-    sweeps: int,
 ) -> RolloutDomain:
     gas = kind.is_gas
     if isinstance(system_or_terrain, PoissonSystem):
@@ -157,7 +155,7 @@ def _layout(
         system = build_system(gas_layout(types) if gas else types, system_or_terrain, grid, open_border=gas)
     smoke = (types == CellType.FLUID).astype(float) if gas else None
     outlet = mainstream if (types == CellType.OUTFLOW).any() else None
-    return prepare_domain(types, system, mainstream=outlet, smoke=smoke, sweeps=sweeps)
+    return prepare_domain(types, system, mainstream=outlet, smoke=smoke, sweeps=5)
 
 
 def plan_windows(

@@ -72,15 +72,14 @@ def smooth_in_time(
     seen: Sequence[Bool[np.ndarray, " f"]],
     at: int,
     *,
-    reach: int = 2,
     within: range | None = None,
 ) -> tuple[Float[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
-    """Value at frame `at` of the straight line through `reach` frames on either side, face by face.
+    """Value at frame `at` of the straight line through two frames on either side, face by face.
 
     Faces seen less than three times take their mean. The second result marks faces seen at all. `within` are the frames
     that follow each other there; None: all.
     """
-    near = [t for t in range(at - reach, at + reach + 1) if t in (within or range(len(frames)))]
+    near = [t for t in range(at - 2, at + 3) if t in (within or range(len(frames)))]
     m = np.stack([seen[t] for t in near]).astype(float)
     y = np.stack([np.asarray(frames[t], float) for t in near])
     x = np.array([t - at for t in near], float)[:, None]

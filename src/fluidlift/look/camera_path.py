@@ -11,6 +11,9 @@ from fluidlift.errors import require
 from fluidlift.look.scenery import orbit_camera
 from fluidlift.types import PinholeCamera, ViewKey
 
+ELEVATION = 24.0
+"""degrees above the horizontal, of views from all around"""
+
 
 def orbit_path(
     camera: PinholeCamera,
@@ -18,7 +21,6 @@ def orbit_path(
     frames: int,
     *,
     turn: float = 360.0,
-    elevation: float = 24.0,
     size: tuple[int, int] | None = None,
 ) -> list[PinholeCamera]:
     """Cameras that go around the middle of some points at one height and distance, from the side of the original view.
@@ -30,12 +32,11 @@ def orbit_path(
         points: what must be seen from everywhere, m.
         frames: of the film.
         turn: degrees over all frames, counter-clockwise seen from above.
-        elevation: degrees above the horizontal.
         size: of the picture; None keeps the original's.
     """
     require(frames > 0, f"{frames} frames", "at least one")
     steps = frames if abs(turn) % 360.0 == 0.0 else max(frames - 1, 1)
-    around = [orbit_camera(camera, points, azimuth=turn * k / steps, elevation=elevation, size=size)
+    around = [orbit_camera(camera, points, azimuth=turn * k / steps, elevation=ELEVATION, size=size)
               for k in range(frames)]  # fmt: skip
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     # each is as near as its own view allows: from one distance nothing swells on the way

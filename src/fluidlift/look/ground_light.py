@@ -89,7 +89,7 @@ class Casters:
         """Of opaque meshes and of a liquid, which lets light through if its material is known.
 
         Args:
-            meshes, caster, material: as of `ground_picture`.
+            meshes, caster, material: as of `ground_picture.GroundMeshes` and its `picture`.
             beside: what stays, where these are what moves.
             inset: m, as of the field.
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from fluidlift.look.environment import Environment
 
 __all__ = [
-    "GRAY", "GroundLight", "GroundMeshes", "ground_picture", "place_of", "received", "spread_directions",
+    "GRAY", "GroundLight", "GroundMeshes", "place_of", "received", "spread_directions",
     "surroundings",
 ]  # fmt: skip
 
@@ -52,42 +52,14 @@ CLEFT = 0.02
 """share of the ambient light that gets into the narrowest cleft, which none of the directions meets"""
 
 
-def ground_picture(
-    meshes: Sequence[TriangleMesh],
-    camera: PinholeCamera,
-    environment: Environment,
-    behind: Behind | None = None,
-    caster: TriangleMesh | None = None,
-    *,
-    material: Material | None = None,
-    lit: GroundLight | None = None,
-) -> Behind:
-    """Meshes lit by the environment, before what lies behind them. For many pictures: `GroundMeshes.picture`.
+class GroundMeshes:
+    """Meshes lit by an environment, which stay where they are, prepared for pictures.
 
     Args:
         meshes: terrain and obstacles, with textures or vertex colours (sRGB), which are taken for the albedo of matt
             surfaces.
-        camera: who looks.
         environment: the light.
-        behind: what is seen where there are no meshes, or nearer than they; None: the environment itself.
-        caster: a closed mesh that is not drawn but throws its shadow, as the surface of the liquid.
-        material: of the caster: what light is left behind it; None: no light passes.
         lit: shadow maps.
-
-    Returns:
-        Linear picture and depth.
-
-    Raises:
-        ValueError: `behind` of another size.
-    """
-    return GroundMeshes(meshes, environment, lit).picture(camera, behind, caster, material=material)
-
-
-class GroundMeshes:
-    """Meshes that stay where they are, prepared for pictures.
-
-    Args:
-        meshes, environment, lit: as of `ground_picture`.
         casters: what throws shadows in place of these meshes, as `casters` of another ground.
     """
 
@@ -115,10 +87,19 @@ class GroundMeshes:
         bodies: Sequence[TriangleMesh] = (),
         inset: float = 0.0,
     ) -> Behind:
-        """`ground_picture` of these meshes and of `bodies`, which move. What is found of the meshes alone is kept for
-        the last camera: the picture is the same, and the next one costs what moves.
+        """Linear picture and depth of these meshes before what lies behind them. What is found of the meshes alone is
+        kept for the last camera: the picture is the same, and the next one costs what moves.
 
-        inset: m that the caster stands outside of the liquid that it is made of.
+        Args:
+            camera: who looks.
+            behind: what is seen where there are no meshes, or nearer than they; None: the environment itself.
+            caster: a closed mesh that is not drawn but throws its shadow, as the surface of the liquid.
+            material: of the caster: what light is left behind it; None: no light passes.
+            bodies: meshes that move.
+            inset: m that the caster stands outside of the liquid that it is made of.
+
+        Raises:
+            ValueError: `behind` of another size.
         """
         width, height = camera.size
         behind = behind or surroundings(camera, self.environment)
@@ -337,7 +318,7 @@ def received(
     Args:
         points: m, world, on the meshes.
         normals: unit, outward.
-        meshes, environment, caster, material, lit: as of `ground_picture`.
+        meshes, environment, caster, material, lit: as of `GroundMeshes` and its `picture`.
     """
     lit = lit or GroundLight()
     p, n = np.asarray(points, np.float64), np.asarray(normals, np.float32)

@@ -112,15 +112,16 @@ def _surfels(points: np.ndarray, normals: np.ndarray, spacing: np.ndarray | floa
     return Gaussians(points, quats, scales, np.full(len(points), opacity), sh_from_rgb(colors * shade[:, None]))
 
 
-def mesh_surfels(
-    mesh: TriangleMesh, spacing: float, *, color: tuple[float, float, float] = (0.75, 0.35, 0.2), most: int = 60_000
-) -> Gaussians:
+UNPAINTED = (0.75, 0.35, 0.2)
+"""sRGB, of a mesh without colours of its own: brick, which no fluid is"""
+
+
+def mesh_surfels(mesh: TriangleMesh, spacing: float, *, most: int = 60_000) -> Gaussians:
     """Flat Gaussians all over the faces of a mesh, about `spacing` (m) apart, farther where there would be too many.
 
     Args:
         mesh: any triangles; a large one gets many surfels.
         spacing: m.
-        color: sRGB, of a mesh without colours of its own.
         most: surfels, about.
     """
     a, b, c = (np.asarray(mesh.vertices, np.float64)[mesh.faces[:, k]] for k in range(3))
@@ -131,7 +132,7 @@ def mesh_surfels(
     share = np.stack([1 - at.s - at.t, at.s, at.t], -1)[..., None]
     where = (np.stack([a, b, c], 1)[at.face] * share).sum(axis=1)
     normals = 0.5 * cross[at.face] / area[at.face, None]
-    painted = np.array([color] * len(where))
+    painted = np.array([UNPAINTED] * len(where))
     if mesh.colors is not None:
         painted = (np.asarray(mesh.colors, np.float64)[mesh.faces[at.face]] * share).sum(axis=1)
     return _surfels(where, normals, at.size, painted, 0.98)
@@ -174,18 +175,18 @@ def _cut(area: np.ndarray, corners: tuple[np.ndarray, np.ndarray, np.ndarray], s
 
 
 def terrain_depth(
-    terrain: Terrain, camera: PinholeCamera, *, steps: int = 96, where: Bool[np.ndarray, "h w"] | None = None
+    terrain: Terrain, camera: PinholeCamera, *, where: Bool[np.ndarray, "h w"] | None = None
 ) -> Float[np.ndarray, "h w"]:
     """Camera depth (m) at which each pixel's ray meets the terrain; inf where it does not (sphere tracing), and beside
     the pixels that are asked for."""
     if where is not None:
         out = np.full(where.shape, np.inf)
-        out[where] = _met(terrain, camera, camera.rays(camera.pixel_grid()[where]), steps)
+        out[where] = _met(terrain, camera, camera.rays(camera.pixel_grid()[where]))
         return out
-    return _met(terrain, camera, camera.rays(camera.pixel_grid()).reshape(-1, 3), steps).reshape(camera.size[::-1])
+    return _met(terrain, camera, camera.rays(camera.pixel_grid()).reshape(-1, 3)).reshape(camera.size[::-1])
 
 
-def _met(terrain: Terrain, camera: PinholeCamera, rays: np.ndarray, steps: int) -> np.ndarray:
+def _met(terrain: Terrain, camera: PinholeCamera, rays: np.ndarray) -> np.ndarray:
     grid = terrain.grid
     length = np.linalg.norm(rays, axis=1)
     eye = camera.position
@@ -196,7 +197,7 @@ def _met(terrain: Terrain, camera: PinholeCamera, rays: np.ndarray, steps: int) 
     z = np.maximum(near, 1e-6) + 1e-6
     hit = np.zeros(len(z), bool)
     active = np.where(far > z)[0]
-    for _ in range(steps):
+    for _ in range(96):
         if len(active) == 0:
             break
         p = eye + rays[active] * z[active, None]

@@ -72,7 +72,6 @@ def particle_surface(
     camera: PinholeCamera,
     colors_linear: Float[np.ndarray, "n 3"] | None = None,
     *,
-    spacing: float | None = None,
     ground: Float[np.ndarray, "h w"] | None = None,
     far_side: bool = False,
 ) -> SurfaceBuffer:
@@ -84,8 +83,6 @@ def particle_surface(
         radius: m, of the spheres.
         camera: who looks.
         colors_linear: of each particle; None: gray.
-        spacing: m between neighbours, which sets what a sphere counts for in the thickness (spheres overlap); None:
-            `SPACING` radii.
         ground: camera z (m; 0: none) of what the liquid lies on. It hides particles, and the surface runs out on it;
             None: every outline is rounded, as of a drop in the air.
         far_side: light leaves a far side bent once more, `thickness` behind the near one: a jet is not seen else. Not
@@ -100,15 +97,13 @@ def particle_surface(
     colors = np.zeros((0, 3), np.float32) if colors_linear is None else np.asarray(colors_linear, np.float32)
     fits = colors_linear is None or colors.shape == points.shape
     require(fits, f"colours of shape {colors.shape}", str(points.shape))
-    spacing = SPACING * radius if spacing is None else spacing
-    require(spacing > 0, f"a spacing of {spacing}", "positive metres")
     height, width = camera.size[1], camera.size[0]
     bed = np.zeros((height, width), np.float32) if ground is None else np.ascontiguousarray(ground, np.float32)
     require(bed.shape == (height, width), f"ground of shape {bed.shape}", f"({height}, {width})")
     depth, typical = _sphere_depth(points, radius, camera)
     thickness, albedo, near = _through_spheres(points, radius, camera, depth, np.ascontiguousarray(colors), typical)
     # spheres overlap: each stands for the volume of a cube of the spacing
-    thickness *= np.float32(spacing**3 / (4.0 / 3.0 * math.pi * radius**3))
+    thickness *= np.float32((SPACING * radius) ** 3 / (4.0 / 3.0 * math.pi * radius**3))
     inverse, normal = np.empty_like(depth), np.zeros((height, width, 3), np.float32)
     inverse_depths(depth, bed, np.float32(NEAR), np.float32(LIMIT * radius), inverse)
     _close_notches(inverse, radius, camera, typical)

@@ -31,12 +31,10 @@ def refined_similarity(
     reference: UInt8[np.ndarray, "h w"],
     picture: UInt8[np.ndarray, "h w"],
     guess: Float[np.ndarray, "2 3"],
-    *,
-    iterations: int = 15,
 ) -> tuple[Float[np.ndarray, "2 3"], float, int]:
     """The similarity [2,3] that carries pixels of the reference to the picture: `refined_turn` without perspective."""
     start = np.vstack([np.asarray(guess, np.float64), [0.0, 0.0, 1.0]])
-    motion, fit, cells = refined_turn(reference, picture, start, iterations=iterations)
+    motion, fit, cells = refined_turn(reference, picture, start)
     return motion[:2], fit, cells
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
-from fluidlift.types import FluidKind, kind_of
+from fluidlift.types import GRAVITY, FluidKind, kind_of
 
 WALLS = ("cubic", "log", "film")
 """wall functions, see `speed_share`"""
@@ -19,8 +19,6 @@ SURFACE_COEFFICIENT = 0.85
 """mean speed over depth by speed at the surface of a stream on a natural bed, where its roughness is not known: what
 gauging with floats uses (Rantz 1982, USGS Water-Supply Paper 2175: 0.85 to 0.86)"""
 
-GRAVITY = 9.81
-"""m/s^2"""
 SLOPE_ERROR = 0.05
 """slope that a stream must exceed to count, at least: 3 degrees. One view tells no pitch better than that; where less
 is known of the slope, that error counts"""

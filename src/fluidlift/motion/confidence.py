@@ -79,7 +79,7 @@ def round_trip(forward: Float[np.ndarray, "h w 2"], backward: Float[np.ndarray, 
     return (inside * tolerance / (tolerance + error)).astype(np.float32)
 
 
-def texture_strength(image: np.ndarray, side: int = TEXTURE_WINDOW) -> Float[np.ndarray, "h w"]:
+def texture_strength(image: np.ndarray) -> Float[np.ndarray, "h w"]:
     """Root mean square gradient in the direction with least texture, units of the picture per px, float32.
 
     It is the root of the smaller eigenvalue of the structure tensor over a window (Shi, Tomasi 1994); an edge without
@@ -87,12 +87,11 @@ def texture_strength(image: np.ndarray, side: int = TEXTURE_WINDOW) -> Float[np.
 
     Args:
         image: u8 sRGB [H,W,3], or one channel [H,W] of any real type.
-        side: of the window, px.
     """
     smooth = cv2.GaussianBlur(grey(image), (0, 0), 1.0).astype(np.float32)
     gx = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32)
     gy = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
-    xx, yy, xy = (cv2.boxFilter(p, cv2.CV_32F, (side, side)) for p in (gx * gx, gy * gy, gx * gy))
+    xx, yy, xy = (cv2.boxFilter(p, cv2.CV_32F, (TEXTURE_WINDOW, TEXTURE_WINDOW)) for p in (gx * gx, gy * gy, gx * gy))
     smaller = 0.5 * (xx + yy - np.sqrt((xx - yy) ** 2 + 4 * xy**2))
     return np.sqrt(np.maximum(smaller, 0.0))
 

@@ -13,6 +13,9 @@ from fluidlift.motion.interpolation import diffusion_interpolation
 from fluidlift.motion.screen_divergence import masked_gradient
 from fluidlift.types import PinholeCamera
 
+SMOOTHING = 0.12
+"""standard deviation over which flow is smoothed, over the root of the mask's area. Where flow is dense half of it is
+used: a jet over its pool is then filled with a third less error, streams alike within 4 %"""
 DOWNHILL_SHARE = 0.1
 """weight of the bed's slope beside confident flow that agrees with itself (1): flow decides where it is known"""
 OPEN_END = 0.02
@@ -24,7 +27,6 @@ def mainstream_direction(
     confidence: Float[np.ndarray, "h w"],
     mask: Bool[np.ndarray, "h w"],
     *,
-    smoothing: float = 0.12,
     downhill: Float[np.ndarray, "h w 2"] | None = None,
 ) -> Float[np.ndarray, "h w 2"]:
     """Unit direction of the bulk flow on the screen (paper: n_k), float32, defined on the whole picture.
@@ -40,8 +42,6 @@ def mainstream_direction(
         displacement: px/frame.
         confidence: 0 to 1.
         mask: the fluid.
-        smoothing: standard deviation of the convolution as a share of the root of the mask's area. Where flow is dense
-            half of it is used: a jet over its pool is then filled with a third less error, streams alike within 4 %.
         downhill: screen direction of steepest descent, of any length; 0 where it is level or unknown
             (`screen_downhill`).
 
@@ -52,7 +52,7 @@ def mainstream_direction(
     inside = mask.astype(np.float32)
     weight = inside * np.asarray(confidence, np.float32) ** 2
     speed = np.hypot(d[..., 0], d[..., 1])
-    extent = math.sqrt(mask.sum())
+    sigma = SMOOTHING * math.sqrt(mask.sum())
 
     def smooth(sigma: float) -> tuple[np.ndarray, np.ndarray]:
         terms = np.dstack([weight[..., None] * d, weight * speed, weight, inside])
@@ -63,9 +63,9 @@ def mainstream_direction(
         unit = np.stack([vx, vy], axis=-1) / np.maximum(length, 1e-9)[..., None]
         return unit, (coherence**2 * share / (share + 0.05))[..., None]
 
-    near, trust_near = smooth(smoothing * extent)
-    nearest, trust_nearest = smooth(0.5 * smoothing * extent)
-    far, trust_far = smooth(4 * smoothing * extent)
+    near, trust_near = smooth(sigma)
+    nearest, trust_nearest = smooth(0.5 * sigma)
+    far, trust_far = smooth(4 * sigma)
     guide = trust_far * far
     mean = (weight[..., None] * d).sum(axis=(0, 1))
     if downhill is not None:
@@ -77,7 +77,7 @@ def mainstream_direction(
     large = _unit(guide + 0.01 * fallback, fallback)
     through = through_direction(mask, large, weight[..., None] * d + 1e-6 * inside[..., None] * large)
     large = large if through is None else through
-    axis, elongation = bank_direction(mask, sigma=smoothing * extent)
+    axis, elongation = bank_direction(mask, sigma=sigma)
     along = np.where((axis * large).sum(axis=-1, keepdims=True) < 0, -axis, axis)
     rest = elongation[..., None] * along + (1 - elongation[..., None]) * large
     found = _unit(trust_near * near + (1 - trust_near) * rest, fallback)

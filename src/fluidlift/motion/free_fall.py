@@ -10,11 +10,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.errors import require, required
-from fluidlift.types import FluidKind, Grid, SurfaceMotion, kind_of
+from fluidlift.types import GRAVITY, FluidKind, Grid, SurfaceMotion, kind_of
 
 BELIEVABLE = 0.3
 """share of the expected speed below which a measured motion counts as failed: friction takes at most half (below)"""
 
+FALLEN = 0.15
+"""share of the whole drop that the fluid has already fallen where it enters the picture"""
 FEWEST = 60
 """points that a lean is read from"""
 LAYERS = 16
@@ -57,7 +59,7 @@ def downhill_of(
 
 def falling_share(
     points: Float[np.ndarray, "n 3"], downhill: Float[np.ndarray, "n 3"], measured: Float[np.ndarray, "n 3"], *,
-    kind: str | FluidKind, top: float, gravity: float,
+    kind: str | FluidKind, top: float,
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:  # fmt: skip
     """Expected velocity and where it should replace the measured one.
 
@@ -67,12 +69,11 @@ def falling_share(
         measured: m/s.
         kind: of the fluid, which falls freely.
         top: height from which the fluid falls, m.
-        gravity: m/s^2, positive.
     """
     kept = required(kind_of(kind).energy_share, f"the kind '{kind}'", "a fluid that falls freely")
     steep = np.clip(-downhill[:, 2], 0.0, 1.0)
     drop = np.maximum(top - points[:, 2], 0.0)
-    speed = np.sqrt(2.0 * gravity * kept * drop) * steep
+    speed = np.sqrt(2.0 * GRAVITY * kept * drop) * steep
     expected = speed[:, None] * downhill
     along = (measured * downhill).sum(axis=1)
     replaced = (steep > 0.5) & (speed > 0) & (along < BELIEVABLE * speed)
@@ -136,8 +137,6 @@ def with_free_fall(
     downhill: Float[np.ndarray, "n 3"],
     *,
     kind: str | FluidKind,
-    gravity: float = 9.81,
-    entry: float = 0.15,
 ) -> tuple[SurfaceMotion, float]:
     """The surface motion with free fall where steep parts seem to stand nearly still. It leans as the fluid is seen to.
 
@@ -145,8 +144,6 @@ def with_free_fall(
         surface: as measured.
         downhill: see `falling_share`; [n,3].
         kind: of the fluid, which falls freely.
-        gravity: m/s^2.
-        entry: share of the whole drop that the fluid has already fallen where it enters the picture.
 
     Returns:
         The motion, and the share of the steep points that was replaced. Replaced points are not `observed`.
@@ -159,9 +156,8 @@ def with_free_fall(
     if len(surface.points) == 0:
         return surface, 0.0
     low, high = np.percentile(surface.points[:, 2], [2, 98])
-    expected, replaced = falling_share(
-        surface.points, downhill, surface.velocities, kind=kind, top=high + entry * (high - low), gravity=gravity
-    )
+    top = high + FALLEN * (high - low)
+    expected, replaced = falling_share(surface.points, downhill, surface.velocities, kind=kind, top=top)
     drift = drift_of(surface.points, downhill, np.linalg.norm(expected, axis=1))
     steep = -downhill[:, 2] > 0.5
     share = float(replaced[steep].mean()) if steep.any() else 0.0

@@ -37,11 +37,11 @@ ROWS = 0.03
 """height of the window over which a row's rise is averaged, as a share of the body's height"""
 
 
-def cap_speed(masks: Bool[np.ndarray, "t h w"], t: int, *, half_window: int = 6) -> float:
+def cap_speed(masks: Bool[np.ndarray, "t h w"], t: int) -> float:
     """Speed (px per frame, positive upwards) of the upper end of the silhouette around frame t.
 
     The slope of the upper end (`numerics.outline`) over a window is a median of pairwise slopes (Theil-Sen), so that
-    single bad masks do not count. The window grows from `half_window` on either side until the end has risen by
+    single bad masks do not count. The window grows from six frames on either side until the end has risen by
     `COURSE` of the body's height: a thing that stands before the cap, or is taken for smoke, holds up the mask, and not
     the smoke. 0 where the silhouette touches the upper border.
     """
@@ -50,7 +50,7 @@ def cap_speed(masks: Bool[np.ndarray, "t h w"], t: int, *, half_window: int = 6)
     if not len(rows):
         return 0.0
     goal = COURSE * (rows[-1] - rows[0] + 1)
-    for half in range(half_window, max(len(masks), half_window + 1)):
+    for half in range(6, max(len(masks), 7)):
         first, last = max(t - half, 0), min(t + half + 1, len(masks))
         speed = _slope(np.arange(first, last), ends[first:last])
         if speed * (last - first - 1) >= goal or last - first == len(masks):

@@ -56,7 +56,6 @@ def diffusion_interpolation(
     anisotropy: float = 1.0,
     depth: Float[np.ndarray, "h w"] | None = None,
     tolerance: float = 1e-3,
-    iterations: int = 200,
 ) -> tuple[Float[np.ndarray, "h w c"], Bool[np.ndarray, "h w"], SolveReport]:
     """Values everywhere in the mask from those that have a weight.
 
@@ -71,7 +70,6 @@ def diffusion_interpolation(
         tolerance: of the residual over the diagonal, relative to that at the start (the given values, and elsewhere
             the mean of those that reach there, as in pieces that are hardly known). With 1e-3 flow of simulated clips
             is filled as with 1e-5 to 0.002 px/frame in the mean.
-        iterations: of conjugate gradients at most.
 
     Returns:
         values float32, 0 outside the mask and where no value reaches; whether a value reaches, bool; the report of the
@@ -108,7 +106,7 @@ def diffusion_interpolation(
         given = np.where(strength[1:-1, 1:-1] > 0, values[box][..., channel], 0.0)
         mean = np.bincount(label.ravel(), (strength[1:-1, 1:-1] * given).ravel()) / total
         start = np.where((strength[1:-1, 1:-1] > 0) & ~faint, given, np.where(inside, mean[label], 0.0))
-        return _conjugate_gradient(levels, np.pad(start, 1).astype(np.float32), tolerance, iterations)
+        return _conjugate_gradient(levels, np.pad(start, 1).astype(np.float32), tolerance)
 
     # the kernels release the lock, so the channels, each with its own steps, run side by side
     with ThreadPoolExecutor() as pool:
@@ -195,9 +193,7 @@ def _hierarchy(edges: np.ndarray, weight: np.ndarray) -> list[_Level]:
     return levels
 
 
-def _conjugate_gradient(
-    levels: list[_Level], start: np.ndarray, tolerance: float, iterations: int
-) -> tuple[np.ndarray, SolveReport]:
+def _conjugate_gradient(levels: list[_Level], start: np.ndarray, tolerance: float) -> tuple[np.ndarray, SolveReport]:
     """The solution [H+2,W+2] for the given values, which `start` holds where they have weight.
 
     Preconditioned with one symmetric V-cycle.
@@ -210,7 +206,7 @@ def _conjugate_gradient(
     r = weight * start - image
     first = left = _size(r, inverse)
     rho, step = 1.0, 0
-    while left > tolerance * first + 1e-30 and step < iterations:
+    while left > tolerance * first + 1e-30 and step < 200:
         z = _v_cycle(levels, scratch, r)
         before, rho = rho, _dot(r, z)
         _turn(z, rho / max(before, 1e-30) if step else 0.0, p)

@@ -66,7 +66,6 @@ def complete_flow(
     depth: Float[np.ndarray, "h w"] | None = None,
     *,
     prior: tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"]] | None = None,
-    threshold: float = OBSERVED_CONFIDENCE,
     stall: float = 0.1,
 ) -> tuple[Float[np.ndarray, "h w 2"], Bool[np.ndarray, "h w"]]:
     """Motion of the failed pixels from their neighbours (paper: the interpolation of v_opz; see the module).
@@ -82,7 +81,6 @@ def complete_flow(
         depth: camera z in m, positive inside the mask.
         prior: mean motion of the clip, px/frame, and its confidence, as `mean_flow` gives them: one more neighbour of
             a failed pixel that was observed at other times.
-        threshold: confidence from which flow counts as observed.
         stall: share of the surrounding speed at which confidence is halved; 0 believes in standstill.
 
     Returns:
@@ -99,13 +97,13 @@ def complete_flow(
     n = np.asarray(direction, np.float32)
     slipping, rest = _sticking(d * near[..., None], confidence, mask, n)
     confidence = confidence * slipping
-    observed = mask & (confidence >= threshold)
+    observed = mask & (confidence >= OBSERVED_CONFIDENCE)
     failed = mask & ~observed
     if not observed.any() or not failed.any():
         return np.where(mask[..., None], d, 0.0).astype(np.float32), observed
     given, weight = _given(d, confidence, observed, mask, n)
     if prior is not None:
-        given, weight = _with_prior(given, weight, _seen_before(prior, mask, stall), failed, n, threshold)
+        given, weight = _with_prior(given, weight, _seen_before(prior, mask, stall), failed, n)
     weight = weight + rest
     given = given / np.maximum(weight, 1e-12)[..., None]
     filled, reached, _ = diffusion_interpolation(
@@ -186,12 +184,11 @@ def _seen_before(prior: tuple[np.ndarray, np.ndarray], mask: np.ndarray, stall: 
 
 
 def _with_prior(
-    given: np.ndarray, weight: np.ndarray, prior: tuple[np.ndarray, np.ndarray], failed: np.ndarray, n: np.ndarray,
-    threshold: float,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    given: np.ndarray, weight: np.ndarray, prior: tuple[np.ndarray, np.ndarray], failed: np.ndarray, n: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """`_given` with the clip's mean as one more neighbour of failed pixels, where it was observed."""
     mean, trust = prior
-    beside = np.where(failed & (trust >= threshold), PRIOR_SHARE * _odds(trust) * _cosine(mean, n), 0.0)
+    beside = np.where(failed & (trust >= OBSERVED_CONFIDENCE), PRIOR_SHARE * _odds(trust) * _cosine(mean, n), 0.0)
     return given + beside[..., None] * mean, weight + beside
 
 

@@ -62,7 +62,8 @@ the same error within 1 %"""
 TRIM = 2.5
 """standard deviations of a pixel's own spread beyond which a frame is left out of its mean"""
 EVIDENCE = 0.5
-"""sum of confidences at which a mean deserves a confidence of one half"""
+"""sum of confidences at which a mean deserves a confidence of one half: a pixel that is textured in a few frames only,
+as foam passes, is known from those frames"""
 LEAST_SPREAD = 0.05
 """px; frames that agree better than that are not told apart"""
 NOISE_GRADIENT = 0.5
@@ -94,35 +95,34 @@ class Reading:
     """0 to 1"""
 
 
-def running_window(pair: int, frames: int, reach: int = REACH) -> tuple[int, int] | None:
+def running_window(pair: int, frames: int) -> tuple[int, int] | None:
     """Frames before and after each of the frames `pair` and `pair + 1` that make its running mean.
 
     Both have the same window, or their means would differ for another reason than motion. It is centred where the clip
     allows and shifted at its ends. None where fewer than `SHORTEST` frames fit.
     """
     before, after = pair, frames - 2 - pair
-    length = min(2 * reach + 1, before + after + 1)
+    length = min(2 * REACH + 1, before + after + 1)
     if length < SHORTEST:
         return None
-    left = min(reach, before, length - 1)
+    left = min(REACH, before, length - 1)
     right = min(length - 1 - left, after)
     return length - 1 - right, right
 
 
 def moving_detail(
-    frames: UInt8[np.ndarray, "t h w 3"], pair: int, reach: int = REACH
+    frames: UInt8[np.ndarray, "t h w 3"], pair: int
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]] | None:
     """Log brightness of the frames `pair` and `pair + 1` less their running means, float32.
 
     Args:
         frames: sRGB, or grey [T,H,W]; only the frames of the window are read, one after the other.
         pair: number of the first frame.
-        reach: frames of the mean on either side.
 
     Returns:
         Two pictures; None where the clip is too short for a running mean.
     """
-    window = running_window(pair, len(frames), reach)
+    window = running_window(pair, len(frames))
     if window is None:
         return None
     before, after = window
@@ -409,22 +409,16 @@ def _trusted_mean(window: Iterable[_Weighed]) -> np.ndarray:
 def mean_flow(
     flow: PixelFlow,
     mask: Bool[np.ndarray, "*t h w"] | None = None,
-    *,
-    trim: float = TRIM,
-    evidence: float = EVIDENCE,
 ) -> tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"]]:
     """The mean motion of a steady fluid over all pairs of `flow`, robust against failures of single frames.
 
-    The mean at a pixel is weighted with confidence; then frames further than `trim` times the pixel's own spread from
+    The mean at a pixel is weighted with confidence; then frames further than `TRIM` times the pixel's own spread from
     it are left out, and the mean is taken once more. Spread, and not a fixed distance, decides: real fluctuation
     widens the spread and stays in, so a turbulent mean is not dragged to its mode.
 
     Args:
         flow: the window of frames.
         mask: the fluid [H,W] or [T',H,W] with T' at least the number of pairs; where absent the pixel counts nothing.
-        trim: in standard deviations.
-        evidence: sum of confidences at which the mean deserves a confidence of one half. A pixel that is textured in
-            a few frames only, as foam passes, is known from those frames.
 
     Returns:
         displacement float32 [H,W,2] px/frame and confidence float32 [H,W]: that of the frames which count, lowered
@@ -442,7 +436,7 @@ def mean_flow(
         distance = summed((d - mean) ** 2)
         total = np.maximum(weight.sum(axis=0), 1e-6)
         spread = (weight * distance).sum(axis=0) / total
-        kept = np.where(distance <= trim**2 * np.maximum(spread, LEAST_SPREAD**2), weight, 0.0)
+        kept = np.where(distance <= TRIM**2 * np.maximum(spread, LEAST_SPREAD**2), weight, 0.0)
         mean = _weighted_mean(d, kept)
     total = kept.sum(axis=0)
     held = np.maximum(total, 1e-6)
@@ -451,7 +445,7 @@ def mean_flow(
     frames = total**2 / np.maximum((kept**2).sum(axis=0), 1e-6)
     tolerance = ROUND_TRIP_FLOOR**2 + ROUND_TRIP_SHARE**2 * summed(mean**2)
     certain = tolerance / (tolerance + deviation / np.maximum(frames, 1.0))
-    return mean, (typical * certain * total / (total + evidence**2)).astype(np.float32)
+    return mean, (typical * certain * total / (total + EVIDENCE**2)).astype(np.float32)
 
 
 def _weighted_mean(d: np.ndarray, weight: np.ndarray) -> np.ndarray:

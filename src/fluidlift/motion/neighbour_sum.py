@@ -27,8 +27,6 @@ def complete_by_sum(
     confidence: Float[np.ndarray, "h w"],
     mask: Bool[np.ndarray, "h w"],
     direction: Float[np.ndarray, "h w 2"],
-    *,
-    threshold: float = OBSERVED_CONFIDENCE,
 ) -> tuple[Float[np.ndarray, "h w 2"], Bool[np.ndarray, "h w"]]:
     """Motion of the failed pixels by the paper's sum; observed ones stay.
 
@@ -37,7 +35,6 @@ def complete_by_sum(
         confidence: 0 to 1.
         mask: the fluid.
         direction: n, unit, from `mainstream_direction`.
-        threshold: confidence from which flow counts as observed.
 
     Returns:
         completed float32 [H,W,2] px/frame, 0 outside the mask; observed bool [H,W]. Without a single observed pixel
@@ -48,7 +45,7 @@ def complete_by_sum(
     """
     d, mask = checked_flow(displacement, confidence, mask)
     speed = np.hypot(d[..., 0], d[..., 1])
-    observed = mask & (np.asarray(confidence) >= threshold) & (speed > 0)
+    observed = mask & (np.asarray(confidence) >= OBSERVED_CONFIDENCE) & (speed > 0)
     failed = mask & ~observed
     out = np.where(mask[..., None], d, 0.0).astype(np.float32)
     if not observed.any() or not failed.any():

@@ -89,9 +89,7 @@ def project_screen_divergence(
     camera: PinholeCamera,
     *,
     form: str = "exact",
-    axial_rate: Float[np.ndarray, "h w"] | None = None,
     reach: float | None = None,
-    tolerance: float = 1e-3,
 ) -> tuple[Float[np.ndarray, "h w 2"], SolveReport]:
     """The completed flow with the divergence of `screen_divergence` in the failed pixels; observed ones stay.
 
@@ -119,9 +117,7 @@ def project_screen_divergence(
         depth_rate: m/frame, see `screen_divergence`.
         camera: of the picture.
         form: see `screen_divergence`.
-        axial_rate: see `screen_divergence`.
         reach: px, see above; None: `validated_reach`.
-        tolerance: share of the excess divergence that may stay.
 
     Returns:
         displacement float32 [H,W,2] and the report of the solve.
@@ -129,11 +125,11 @@ def project_screen_divergence(
     d, mask = np.asarray(displacement, np.float32), np.asarray(mask, bool)
     failed = mask & ~np.asarray(observed, bool)
     if reach is None:
-        reach = validated_reach(d, mask, observed, depth, depth_rate, camera, form=form, axial_rate=axial_rate)
+        reach = validated_reach(d, mask, observed, depth, depth_rate, camera, form=form)
     if reach == 0 or not failed.any():
         return d.copy(), SolveReport(True, 0, 0.0, "none", "the constraint was not used")
-    wanted = screen_divergence(d, mask, depth, depth_rate, camera, form=form, axial_rate=axial_rate)
-    return _projected(d, mask, failed, wanted, reach, tolerance)
+    wanted = screen_divergence(d, mask, depth, depth_rate, camera, form=form)
+    return _projected(d, mask, failed, wanted, reach, 1e-3)
 
 
 def validated_reach(
@@ -145,7 +141,6 @@ def validated_reach(
     camera: PinholeCamera,
     *,
     form: str = "exact",
-    axial_rate: Float[np.ndarray, "h w"] | None = None,
 ) -> float:
     """The reach in px with which the constraint predicts this fluid's own observed motion best; 0: not at all.
 
@@ -175,7 +170,7 @@ def validated_reach(
         d * near[..., None], CERTAIN * known, mask, n, anisotropy=4.0, depth=near, tolerance=3e-3
     )
     guess = np.where((known | ~reached)[..., None], d, filled / near[..., None]).astype(np.float32)
-    wanted = screen_divergence(guess, mask, depth, depth_rate, camera, form=form, axial_rate=axial_rate)
+    wanted = screen_divergence(guess, mask, depth, depth_rate, camera, form=form)
 
     def errors(v: np.ndarray) -> np.ndarray:
         return np.bincount(patch, np.linalg.norm((v - d)[hidden], axis=-1))

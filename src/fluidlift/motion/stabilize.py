@@ -228,7 +228,7 @@ def motions_of_shots(frames: np.ndarray, cuts: tuple[int, ...], limit: float) ->
     return motions, blind
 
 
-def find_cuts(grey: Sequence[np.ndarray], *, least: float = 0.45) -> tuple[int, ...]:
+def find_cuts(grey: Sequence[np.ndarray]) -> tuple[int, ...]:
     """First frames of new shots, from u8 [H,W] pictures.
 
     Two pictures differ by as much as the correlation of their layouts (32 x 18 px, so brightness and contrast do not
@@ -247,7 +247,7 @@ def find_cuts(grey: Sequence[np.ndarray], *, least: float = 0.45) -> tuple[int, 
             unlike(layouts[max(t - 2, 0)], layouts[t]), unlike(layouts[t - 1], layouts[min(t + 1, len(layouts) - 1)])
         )
         usual = float(np.median(near)) if len(near) else 0.0
-        if jump > least and lasting > 0.8 * least and jump > 3.0 * usual and jump >= near.max(initial=0.0):
+        if jump > 0.45 and lasting > 0.36 and jump > 3.0 * usual and jump >= near.max(initial=0.0):
             cuts.append(t)
     return tuple(cuts)
 

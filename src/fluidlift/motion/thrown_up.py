@@ -15,10 +15,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from fluidlift.errors import require
-from fluidlift.types import CellType, FaceVelocity, Grid
-
-GRAVITY = 9.81
-"""m/s^2"""
+from fluidlift.types import GRAVITY, CellType, FaceVelocity, Grid
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ class Tracks:
         return np.isfinite(self.places[..., 0])
 
 
-def follow(grey: Sequence[np.ndarray], *, per_cell: int = PER_CELL) -> Tracks:
+def follow(grey: Sequence[np.ndarray]) -> Tracks:
     """Tracks through u8 [H,W] pictures; those of a single frame are left out.
 
     Each corner is found in the picture where it was seen first, not in the one before: errors of single steps (a tenth
@@ -53,7 +53,7 @@ def follow(grey: Sequence[np.ndarray], *, per_cell: int = PER_CELL) -> Tracks:
         for group in groups:
             group.go_on(picture, t)
         if t % renewed == 0 and t + 1 < count:
-            groups.append(_Born.of(picture, t, count, [g.places[:, t] for g in groups], per_cell))
+            groups.append(_Born.of(picture, t, count, [g.places[:, t] for g in groups]))
     places = np.concatenate([group.places for group in groups]).astype(np.float64)
     seen = np.isfinite(places[..., 0]).sum(axis=1)
     height, width = grey[0].shape
@@ -73,10 +73,10 @@ class _Born:
     first: int
 
     @classmethod
-    def of(cls, picture: np.ndarray, t: int, count: int, known: list[np.ndarray], per_cell: int) -> _Born:
+    def of(cls, picture: np.ndarray, t: int, count: int, known: list[np.ndarray]) -> _Born:
         """Corners of a picture that do not lie near those that are `known` ([n,2] each)."""
         height, width = picture.shape
-        fresh = spread_features(picture, per_cell=per_cell)[:, 0]
+        fresh = spread_features(picture, per_cell=PER_CELL)[:, 0]
         near = np.zeros((height, width), np.uint8)
         for x, y in np.concatenate([np.zeros((0, 2)), *known]):
             if np.isfinite(x):

@@ -105,14 +105,8 @@ def passed_through(
     return through[label]
 
 
-def balance_surface(
-    velocity: FaceVelocity,
-    types: UInt8[np.ndarray, "nx ny nz"],
-    openings: Faces,
-    *,
-    radius: float = BALANCE_RADIUS,
-) -> FaceVelocity:
-    """No net flux through the free surface, over patches some `radius` cells wide.
+def balance_surface(velocity: FaceVelocity, types: UInt8[np.ndarray, "nx ny nz"], openings: Faces) -> FaceVelocity:
+    """No net flux through the free surface, over patches some `BALANCE_RADIUS` cells wide.
 
     The kinematic condition of a surface at rest is v . n = 0. The faces between liquid and air are steps, so it holds
     for sums over patches and not for each: fluid leaves through the front of a step and enters through the flat
@@ -133,7 +127,7 @@ def balance_surface(
         return np.where(fluid, total, 0.0)
 
     def blurred(cells: np.ndarray) -> np.ndarray:
-        return ndimage.gaussian_filter(cells, radius, mode="constant", truncate=2.5)
+        return ndimage.gaussian_filter(cells, BALANCE_RADIUS, mode="constant", truncate=2.5)
 
     area = of_cells([np.abs(s) * o for s, o in zip(outward, openings)])
     flux = of_cells([s * o * f for s, o, f in zip(outward, openings, faces)])

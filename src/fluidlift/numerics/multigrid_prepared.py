@@ -13,11 +13,12 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import get_num_threads, njit
+from numba import get_num_threads
 
 from fluidlift.numerics import components, multigrid, multigrid_cycle
+from fluidlift.numerics.multigrid_assembly import load, store
 from fluidlift.numerics.multigrid_cycle import Hierarchy
-from fluidlift.numerics.multigrid_kernels import CELLS, PARTS, PLANES, ROW_BASE, ROWS, place
+from fluidlift.numerics.multigrid_kernels import CELLS, PARTS, PLANES
 
 _ASSEMBLING = threading.Lock()
 
@@ -61,11 +62,11 @@ class PreparedSystem:
         h, means, closed = assembled
         g, corner = h.fine
         with self._vectors(h) as v:
-            squares = _load(g, corner, np.ascontiguousarray(rhs), float(self.spacing) ** 2, h.cells, v.b)
+            squares = load(g, corner, np.ascontiguousarray(rhs), float(self.spacing) ** 2, h.cells, v.b)
             v.p.fill(0.0)
             if initial is not None:
                 guess = np.ascontiguousarray(initial)
-                squares += 0.0 * _load(g, corner, guess, 1.0, h.cells, v.p)  # not finite if the guess is not
+                squares += 0.0 * load(g, corner, guess, 1.0, h.cells, v.p)  # not finite if the guess is not
             if not np.isfinite(squares):
                 return multigrid.Solution(out, 0, float("nan"), closed, 0.0)
             removed = means.remove(v.b)
@@ -74,7 +75,7 @@ class PreparedSystem:
                 return multigrid.Solution(out, 0, 0.0, closed, removed)
             iterations, residual = _conjugate_gradients(h, v, tolerance * size, max_iterations)
             means.remove(v.p)
-            _store(g, corner, v.p, h.cells, out)
+            store(g, corner, v.p, h.cells, out)
         return multigrid.Solution(out, iterations, residual / size, closed, removed / size)
 
     def _assemble(self) -> _Assembled | None:
@@ -122,35 +123,3 @@ def _conjugate_gradients(h: Hierarchy, v: _Vectors, goal: float, max_iterations:
     v.direction.fill(0.0)
     levels = (h.geometry, h.common, work, h.operator, h.rows, h.segments)
     return multigrid_cycle.conjugate_gradients_alone(levels, v.p, v.b, goal, max_iterations, (v.q, v.r, v.direction))
-
-
-@njit(cache=True, nogil=True)
-def _load(g, corner, values, factor, cells, out):
-    """`multigrid_assembly.load` on one thread."""
-    inverse, first, last = cells
-    total = 0.0
-    for i in range(1, g[PLANES] - 1):
-        squares = 0.0
-        for j in range(1, g[ROWS] - 1):
-            row = g[ROW_BASE] + i * g[ROWS] + j
-            for k in range(first[row], last[row]):
-                o = place(g, i, j, k)
-                if inverse[o] > 0:
-                    value = factor * values[corner[0] + i - 1, corner[1] + k - 1, corner[2] + j - 1]
-                    out[o] = value
-                    squares += value * value
-        total += squares
-    return total
-
-
-@njit(cache=True, nogil=True)
-def _store(g, corner, values, cells, out):
-    """`multigrid_assembly.store` on one thread."""
-    inverse, first, last = cells
-    for i in range(1, g[PLANES] - 1):
-        for j in range(1, g[ROWS] - 1):
-            row = g[ROW_BASE] + i * g[ROWS] + j
-            for k in range(first[row], last[row]):
-                o = place(g, i, j, k)
-                if inverse[o] > 0:
-                    out[corner[0] + i - 1, corner[1] + k - 1, corner[2] + j - 1] = values[o]

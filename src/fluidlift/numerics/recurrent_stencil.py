@@ -87,12 +87,10 @@ class FittedStencil:
         turn = np.arange(sub_steps) % len(self.relaxation)
         return self.relaxation[turn], self.momentum[turn]
 
-    def amplification(
-        self, eigenvalues: Float[np.ndarray, " n"], sub_steps: int | None = None
-    ) -> Float[np.ndarray, " n"]:
+    def amplification(self, eigenvalues: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """What is left of the error's component of each eigenvalue of S K S A; below 1 on (0, bound]: converges."""
         error, change = np.ones_like(eigenvalues), np.zeros_like(eigenvalues)
-        for w, m in zip(*self.schedule(sub_steps or self.sub_steps)):
+        for w, m in zip(*self.schedule(self.sub_steps)):
             change = m * change - w * eigenvalues * error
             error = error + change
         return np.abs(error)

@@ -88,7 +88,7 @@ class StencilValidation:
         if self.accepted:
             return ""
         if not self.converges_anywhere:
-            return "the fitted schedule amplifies part of the error: use the implicit route, or fit with a cycle of 1"
+            return "the fitted schedule amplifies part of the error: use the implicit route"
         worst = int(np.argmax(self.errors / self.jacobi_errors))
         return (
             f"on sample {worst} the stencil leaves {self.errors[worst]:.2g} of the potential, as many Jacobi sweeps "
@@ -99,7 +99,7 @@ class StencilValidation:
 class _RawWeights:
     """The optimiser's variables and the weights that they stand for."""
 
-    def __init__(self, cycle: int, seed: int, dtype: torch.dtype) -> None:
+    def __init__(self, seed: int, dtype: torch.dtype) -> None:
         generator = torch.Generator().manual_seed(seed)
 
         def start(value: float, shape: int, spread: float) -> Tensor:
@@ -108,11 +108,9 @@ class _RawWeights:
 
         momentum = START_MOMENTUM / MOMENTUM_LIMIT
         share = START_RELAXATION / (1 + START_MOMENTUM)
-        # alike members of a cycle, and signs of weights at zero, would never part
-        spread = 0.05 if cycle > 1 else 0.0
-        self.momentum = start(math.log(momentum / (1 - momentum)), cycle, spread)
-        self.relaxation = start(math.log(share / (1 - share)), cycle, spread)
-        self.neighbours = start(0.0, len(NEIGHBOUR_KINDS), 1e-3)
+        self.momentum = start(math.log(momentum / (1 - momentum)), 1, 0.0)
+        self.relaxation = start(math.log(share / (1 - share)), 1, 0.0)
+        self.neighbours = start(0.0, len(NEIGHBOUR_KINDS), 1e-3)  # signs of weights at zero would never part
         self.gains = start(0.0, 2, 0.0)
         self.counts = torch.as_tensor(NEIGHBOUR_COUNTS, dtype=dtype)
         kinds = {kind: i for i, kind in enumerate(NEIGHBOUR_KINDS)} | {(0, 0, 0): len(NEIGHBOUR_KINDS)}
@@ -216,37 +214,30 @@ def fit_stencil(
     sub_steps: int = 100,
     iterations: int = 60,
     seed: int = 0,
-    cycle: int = 1,
-    batch: int = 2,
 ) -> StencilFit:
     """`fit_recurrent_stencil` with its history. Torch keeps some ten values per cell and sub-step of a batch meanwhile.
 
     Args:
         samples: solved problems; their domains may differ.
         sub_steps: of one solve.
-        iterations: of Adam, each on `batch` samples in random order.
+        iterations: of Adam, each on two samples in random order.
         seed: of the order and of the start.
-        cycle: sub-steps after which relaxations and momenta repeat. With 1 they are shared by all layers, and the
-            result converges on any domain; more leave the fit to find that, and `validate` to check it.
-        batch: samples per iteration.
 
     Raises:
         ValueError: no samples, or counts below one.
     """
     require(len(samples) > 0, "no samples", "one solved pressure problem or more")
-    require(
-        min(sub_steps, iterations, cycle, batch) >= 1, "a count below 1", "sub_steps, iterations, cycle, batch >= 1"
-    )
+    require(min(sub_steps, iterations) >= 1, "a count below 1", "sub_steps, iterations >= 1")
     dtype = torch.float32
     data = _Batch.of([PressureSample(*s) for s in samples], dtype)
-    raw, rng = _RawWeights(min(cycle, sub_steps), seed, dtype), np.random.default_rng(seed)
+    raw, rng = _RawWeights(seed, dtype), np.random.default_rng(seed)
     optimizer = _Adam(raw.all())
     errors = []
     order: list[int] = []
     for iteration in range(iterations):
-        if len(order) < batch:
+        if len(order) < 2:
             order += [int(i) for i in rng.permutation(len(samples))]
-        pick, order = order[:batch], order[batch:]
+        pick, order = order[:2], order[2:]
         squared = data.select(pick).squared_errors(raw.layer()[0], sub_steps).mean()
         # the floor of single precision: below it there is nothing to learn
         torch.log(squared + 1e-12).backward()
@@ -274,19 +265,16 @@ def fit_recurrent_stencil(
     return fit_stencil(samples, sub_steps=sub_steps, iterations=iterations, seed=seed).stencil
 
 
-def validate(
-    stencil: FittedStencil, samples: Sequence[PressureSample], *, curve: Sequence[int] | None = None
-) -> StencilValidation:
+def validate(stencil: FittedStencil, samples: Sequence[PressureSample]) -> StencilValidation:
     """Errors, residuals and convergence over sub-steps on samples that the fit should not have seen.
 
     Args:
         stencil: to be judged at its own number of sub-steps.
         samples: (system, rhs, exact q).
-        curve: sub-steps at which errors are told; a dozen up to twice the stencil's number if None.
     """
     require(len(samples) > 0, "no samples", "one solved pressure problem or more")
     n = stencil.sub_steps
-    places = np.unique(np.geomspace(1, 2 * n, 12).round().astype(int)) if curve is None else np.asarray(curve, int)
+    places = np.unique(np.geomspace(1, 2 * n, 12).round().astype(int))
     plain = FittedStencil.jacobi(n)
     ours, theirs = (np.array([_judged(s, PressureSample(*x), n) for x in samples]) for s in (stencil, plain))
     curve_of = [

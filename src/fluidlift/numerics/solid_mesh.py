@@ -197,18 +197,17 @@ def ellipsoid_mesh(semi_axes: Float[np.ndarray, "3"] | Sequence[float] | float, 
     return TriangleMesh(vertices * axes * np.cbrt(4.0 / 3.0 * np.pi / moments(ball).volume), faces)
 
 
-def cylinder_mesh(radius: float, height: float, segments: int = 64) -> TriangleMesh:
+def cylinder_mesh(radius: float, height: float) -> TriangleMesh:
     """A cylinder along z around the origin; its base is a regular polygon with the area of the circle."""
     require(radius > 0 and height > 0, f"radius {radius}, height {height}", "positive metres")
-    require(segments >= 3, f"{segments} segments", "at least 3")
-    angle = 2 * np.pi * np.arange(segments) / segments
-    polygon = radius * np.sqrt(np.pi / (segments * np.sin(np.pi / segments) * np.cos(np.pi / segments)))
+    n = 64
+    i = np.arange(n)
+    j = (i + 1) % n
+    angle = 2 * np.pi * i / n
+    polygon = radius * np.sqrt(np.pi / (n * np.sin(np.pi / n) * np.cos(np.pi / n)))
     ring = polygon * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    low, high = (np.column_stack([ring, np.full(segments, z)]) for z in (-0.5 * height, 0.5 * height))
+    low, high = (np.column_stack([ring, np.full(n, z)]) for z in (-0.5 * height, 0.5 * height))
     vertices = np.concatenate([low, high, [[0, 0, -0.5 * height], [0, 0, 0.5 * height]]])
-    i = np.arange(segments)
-    j = (i + 1) % segments
-    n = segments
     faces = [
         (i, j, n + j), (i, n + j, n + i), (j, i, np.full(n, 2 * n)), (n + i, n + j, np.full(n, 2 * n + 1)),
     ]  # fmt: skip

@@ -179,9 +179,9 @@ def bin_tiles(projected: Projected, size: tuple[int, int], tile: int = TILE, *, 
     return replace(bins, whole=_dealt(bins, bins.bands[0], counts, pairs, slots)) if len(bins.bands) == 1 else bins
 
 
-def tiles_met(projected: Projected, size: tuple[int, int], tile: int = TILE) -> float:
+def tiles_met(projected: Projected, size: tuple[int, int]) -> float:
     """About how many pairs of tile and Gaussian a picture has (an upper bound, nearly)."""
-    return float(met_kernel(projected.extents, tile, *size))
+    return float(met_kernel(projected.extents, TILE, *size))
 
 
 def _order(projected: Projected) -> Int[np.ndarray, " m"]:

@@ -46,7 +46,6 @@ class RigidBodies:
         walls: terrain and box, without bodies.
         density: of the liquid, kg/m^3.
         gravity: m/s^2.
-        time: s, at the start.
 
     Raises:
         InputRejected: a body outside the box that does not fall into it, or two of one name.
@@ -59,11 +58,10 @@ class RigidBodies:
         *,
         density: float,
         gravity: Float[np.ndarray, "3"] | Sequence[float],
-        time: float = 0.0,
     ) -> None:
         self.bodies, self._static = tuple(bodies), walls
         self._density, self._gravity = float(density), np.asarray(gravity, np.float64)
-        self.time, self.removed = float(time), 0
+        self.time, self.removed = 0.0, 0
         """s, and particles that found no place beside the bodies"""
         h, n = walls.grid.spacing, len(self.bodies)
         self._cell_mass = self._density * h**3  # of liquid, kg

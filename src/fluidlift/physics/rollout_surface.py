@@ -33,11 +33,11 @@ INSIDE = 1e-3
 """cells: a liquid cell's centre is at least so far inside, an empty one's outside"""
 
 
-def sides(cells: np.ndarray, axis: int, outside: float = 0) -> tuple[np.ndarray, np.ndarray]:
+def sides(cells: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Value of the cell on the low and on the high side of every face across `axis`."""
     pad = [(0, 0)] * 3
     pad[axis] = (1, 1)
-    wide = np.pad(cells, pad, constant_values=outside)
+    wide = np.pad(cells, pad)
     n = cells.shape[axis]
     return np.take(wide, range(n + 1), axis), np.take(wide, range(1, n + 2), axis)
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import require
+from fluidlift.types import GRAVITY
 
 STEEPEST = 0.44
 """a k at which waves break: amplitude times wavenumber of the highest steady wave on deep water (Stokes 1880)"""
@@ -23,7 +24,7 @@ class WaveMedium:
 
     depth: float = 1e3
     """h, m"""
-    gravity: float = 9.81
+    gravity: float = GRAVITY
     """g, m/s^2"""
     tension: float = 7.28e-5
     """T / rho, m^3/s^2: 0.0728 N/m over 1000 kg/m^3, water at 20 degrees Celsius"""

@@ -90,8 +90,8 @@ def channel_setting(seen: PlanEvidence, config: ChannelConfig) -> Setting:
         depth = cross_section.usual_depth(extent.width, share)
     beach = seen.reaches_horizon and config.depth_ratio is None
     if beach:  # a guess for pools would be a bay as deep as a fifth of what is seen of it
-        across = np.linalg.norm(extent.high - extent.low, keepdims=True)
-        depth = float(cross_section.shelving(across)[0])
+        across = float(np.linalg.norm(extent.high - extent.low))
+        depth = float(cross_section.shelving(np.array([across]))[0])
         depth = max(depth, SHALLOWEST * float((extent.high - extent.low).max()) / config.longest)
     spacing = max((extent.high - extent.low).max() / config.longest, depth / 10)
     spacing = min(spacing, depth / 4)  # fewer than four cells hold no velocity profile
@@ -140,8 +140,8 @@ def _within_horizon(grid: Grid, plan: Plan) -> Grid:
     return Grid((*(last - first + 1).tolist(), grid.shape[2]), grid.spacing, triple(low.tolist()))
 
 
-def _ground_samples(low, high, n: int = 24) -> np.ndarray:
-    x, y = np.meshgrid(np.linspace(low[0], high[0], n), np.linspace(low[1], high[1], n), indexing="ij")
+def _ground_samples(low, high) -> np.ndarray:
+    x, y = np.meshgrid(np.linspace(low[0], high[0], 24), np.linspace(low[1], high[1], 24), indexing="ij")
     return np.stack([x, y], -1)
 
 

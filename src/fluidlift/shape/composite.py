@@ -18,7 +18,7 @@ from fluidlift.shape.jet_column import Jet, with_columns
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.slope import LEVEL
 from fluidlift.shape.surface import FrontSurface
-from fluidlift.types import FluidKind, MetricScale, PinholeCamera, Setting, Similarity3, UpEvidence
+from fluidlift.types import GRAVITY, FluidKind, MetricScale, PinholeCamera, Setting, Similarity3, UpEvidence
 from fluidlift.types.hints import DrawnView
 from fluidlift.types.kind import LOOKING_DOWN, POUR, STREAM
 
@@ -204,7 +204,7 @@ def with_chute(
     gravity = chute.head_acceleration(points[part], velocities[part], trust[part])
     if gravity is None:
         return scale
-    value = registration.STANDARD_GRAVITY / gravity
+    value = GRAVITY / gravity
     across = scale.across * value / scale.value
     if not registration.SHORTEST_FALL < across < LARGEST:
         return scale

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from fluidlift.types import FluidKind, kind_of
+from fluidlift.types import GRAVITY, FluidKind, kind_of
 
 REPOSE = 0.7
 """slope of a bank under water: the tangent of 35 degrees, the angle of repose of gravel and soil (30 to 40 degrees)"""
@@ -198,7 +198,7 @@ def rock_height(reach: Reach) -> Float[np.ndarray, "nx ny"]:
     if not reach.rock.any():
         return np.zeros(reach.rock.shape)
     h, known = reach.spacing, np.isfinite(reach.speed)
-    climb = float(np.median(reach.speed[known]) ** 2) / (2 * 9.81) if known.any() else 0.0
+    climb = float(np.median(reach.speed[known]) ** 2) / (2 * GRAVITY) if known.any() else 0.0
     label, count = ndimage.label(reach.rock, structure=np.ones((3, 3)))
     inner = distance_inside(reach.rock, h)
     radius = np.concatenate([[0.0], np.atleast_1d(ndimage.maximum(inner, label, range(1, count + 1)))])[label]

@@ -58,8 +58,6 @@ class DepthSlope:
     """by the depth alone, degrees"""
     standard_error: float
     """of the measured one, degrees"""
-    unevenness: float
-    """relative error of the depth that the stream's being level across shows"""
     source: str = "depth"
 
 
@@ -150,8 +148,7 @@ def facing(
 
 def up_from_depth(
     scene: SceneDepth, camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], displacement: Float[np.ndarray, "h w 2"],
-    confidence: Float[np.ndarray, "h w"], *, slopes: tuple[tuple[float, float, float], ...] = SLOPES,
-    normal: Float[np.ndarray, "3"] | None = None,
+    confidence: Float[np.ndarray, "h w"], *, normal: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[UpEvidence, float]:  # fmt: skip
     """Up and slope (degrees) of a stream whose camera's tilt nobody knows, from the plane that its depth lies in.
 
@@ -162,7 +159,7 @@ def up_from_depth(
     normal = plane_normal(camera, scene.depth, mask) if normal is None else normal
     flow = _flow_on_plane(camera, normal, mask, displacement, confidence)
     angles = np.arange(0.0, 45.5, 0.5)
-    share = _share_of(angles, slopes)
+    share = _share_of(angles, SLOPES)
     pitches, rolls, belief = [], [], []
     for angle in np.radians(angles):
         # gravity turned so that the plane falls along the flow by this angle
@@ -293,7 +290,6 @@ def stream_surface(
     if scene.floor >= COARSE:
         uneven = max(uneven, _bumpiness(s, across, (points[:, 2] - before), lift))
     height, evidence = _profile(s, points[:, 2], before, lift * uneven, slopes)
-    evidence = replace(evidence, unevenness=uneven)
     model = AlongHeight((float(direction[0]), float(direction[1])), *height)
     model = replace(model, relief=_relief(s, across, points[:, 2] - model.height(points[:, :2]), lift * uneven))
     near, far = 0.3 * float(np.nanmin(scene.depth[use])), 4.0 * float(np.nanmax(scene.depth[use]))
@@ -377,7 +373,7 @@ def _profile(s, z, before, error, slopes) -> tuple[tuple[np.ndarray, np.ndarray]
     heights = shift + line * (knots - middle) + keep * bends[0] + (1.0 - keep) * bends[1]
     if taken > 0:  # water does not run uphill over a length that matters
         heights = 0.5 * (np.minimum.accumulate(heights) + np.maximum.accumulate(heights[::-1])[::-1])
-    return (knots, heights), DepthSlope(taken, measured, float(se), 0.0)
+    return (knots, heights), DepthSlope(taken, measured, float(se))
 
 
 def _weighed(measured: float, error: float, slopes: tuple[tuple[float, float, float], ...]) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from fluidlift.types import GRAVITY
 from fluidlift.types.kind import STEEPEST_STREAM
 
 MANNING = 0.035
@@ -15,7 +16,6 @@ HYDRAULIC = 0.6
 """hydraulic radius over greatest depth of a parabolic bed five times as wide as deep (area 2/3, wetted width 1.1)"""
 MEAN_OF_SURFACE = 0.85
 """mean speed over a column of water over that of its surface (the usual figure of image velocimetry)"""
-GRAVITY = 9.81
 
 
 @dataclass(frozen=True)

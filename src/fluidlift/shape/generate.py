@@ -175,7 +175,6 @@ def front_gaussians(
     camera: PinholeCamera,
     *,
     stride: int = 1,
-    opacity: float = 0.95,
 ) -> Gaussians:
     """One flat Gaussian per pixel block on the visible surface, as large as the block is there.
 
@@ -185,7 +184,6 @@ def front_gaussians(
         depth: camera z, m (positive on the mask).
         camera: in the world.
         stride: width of a block, px.
-        opacity: of each Gaussian.
     """
     require(depth.shape == mask.shape, f"depth {depth.shape} for a mask {mask.shape}")
     ok = mask & (depth > 0)
@@ -209,7 +207,7 @@ def front_gaussians(
     covariance = 0.3 * (_outer(a) + _outer(b)) + _outer(normal * thin[:, None])
     quats, scales = decompose_covariances(covariance, floor=(0.02 * float(np.median(footprint))) ** 2)
     colours = frame[rows, cols].astype(np.float32) / 255.0
-    return Gaussians(points[rows, cols], quats, scales, np.full(len(rows), opacity), sh_from_rgb(colours))
+    return Gaussians(points[rows, cols], quats, scales, np.full(len(rows), 0.95), sh_from_rgb(colours))
 
 
 def _outer(v: np.ndarray) -> np.ndarray:

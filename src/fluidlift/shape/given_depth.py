@@ -141,24 +141,24 @@ def _matched(values: np.ndarray, wanted: np.ndarray, *, with_offset: bool) -> tu
     return (float(line[1]), float(line[0])) if line[1] > 0 else (1.0, float(np.median(wanted - values)))
 
 
-def robust_line(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], steps: int = 8) -> Float[np.ndarray, "2"]:
+def robust_line(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> Float[np.ndarray, "2"]:
     """(a, b) of y = a + b x by iterated least squares with Tukey's biweight, started from quantiles (Brown, Mood)."""
     low, high = x <= np.quantile(x, 1 / 3), x >= np.quantile(x, 2 / 3)
     run = np.median(x[high]) - np.median(x[low])
     slope = (np.median(y[high]) - np.median(y[low])) / run if abs(run) > 1e-12 else 0.0
     line = np.array([np.median(y - slope * x), slope])
-    return _reweighted(np.stack([np.ones_like(x), x], axis=1), y, line, steps)
+    return _reweighted(np.stack([np.ones_like(x), x], axis=1), y, line, 8)
 
 
 def robust_plane(
-    x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"] | None, values: Float[np.ndarray, " n"], steps: int = 12
+    x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"] | None, values: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " k"]:
     """(a, b, c) of values = a + b x + c y (a and b alone without y), by Tukey's biweight from least squares."""
     columns = np.stack([np.ones_like(x), x] + ([] if y is None else [y]), axis=1)
     pick = np.linspace(0, len(x) - 1, min(len(x), 20000)).astype(int)
     columns, values = columns[pick], values[pick]
     start, *_ = np.linalg.lstsq(columns, values, rcond=None)
-    return _reweighted(columns, values, start, steps)
+    return _reweighted(columns, values, start, 12)
 
 
 def _reweighted(columns: np.ndarray, y: np.ndarray, start: np.ndarray, steps: int) -> np.ndarray:

@@ -108,17 +108,17 @@ def anisotropy_loss(scales: Float[Tensor, "n 3"], stretch: float = 1.1) -> Tenso
     return (ordered[:, 0] / ordered[:, 1].clamp(min=1e-12) - stretch).clamp(min=0).mean()
 
 
-def volume_loss(scales: Float[Tensor, "n 3"], form: str = "hinge", ratio: float = 2.0) -> Tensor:
+def volume_loss(scales: Float[Tensor, "n 3"], form: str = "hinge") -> Tensor:
     """Keeps single Gaussians from growing; scales in units of a typical one.
 
     The paper refers to a source that defines no such term. "mean": mean of s1 s2 s3 (as in Scaffold-GS), which shrinks
-    all. "hinge": mean of max(V / median(V) - ratio, 0) with V = s1 s2 s3, which only holds the large ones and leaves
+    all. "hinge": mean of max(V / median(V) - 2, 0) with V = s1 s2 s3, which only holds the large ones and leaves
     the size of the body alone. The median carries no gradient.
     """
     volume = scales.prod(1)
     if form == "mean":
         return volume.mean()
-    return (volume / volume.detach().median().clamp(min=1e-20) - ratio).clamp(min=0, max=1e3).mean()
+    return (volume / volume.detach().median().clamp(min=1e-20) - 2.0).clamp(min=0, max=1e3).mean()
 
 
 def scale_loss(scales: Float[Tensor, "n 3"]) -> Tensor:

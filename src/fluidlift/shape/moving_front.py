@@ -140,7 +140,7 @@ def without_strays(labels: np.ndarray) -> int:
         before = numbered + 1
     if not volume:
         return 0
-    linked = coo_array((np.ones(len(edges)), tuple(np.array(edges, int).reshape(-1, 2).T)), (len(volume),) * 2)
+    linked = coo_array((np.ones(len(edges)), tuple(np.array(edges, int).reshape(-1, 2).T)), (len(volume), len(volume)))
     whole = connected_components(linked, directed=False)[1]
     sizes = np.bincount(whole, volume)
     frames = np.array([len(set(np.array(frame)[whole == w].tolist())) for w in range(len(sizes))])

@@ -11,6 +11,9 @@ from fluidlift.errors import require
 from fluidlift.numerics.nearest import nearest
 from fluidlift.types.gaussians import Gaussians
 
+LARGEST = 0.25
+"""standard deviation over the body's size (`body_size`): more than any piece of a body can be"""
+
 
 @dataclass(frozen=True)
 class PruneReport:
@@ -30,19 +33,13 @@ def prune(
     *,
     min_opacity: float = 0.05,
     max_stretch: float = 10.0,
-    max_scale: float | None = None,
-    neighbours: int = 4,
 ) -> tuple[Gaussians, PruneReport]:
-    """Drop what is not a piece of the fluid.
+    """Drop what is not a piece of the fluid: also what is larger than `LARGEST` of the body, and what is `lonely`.
 
     Args:
         gaussians: any Gaussians, m.
         min_opacity: fainter ones go.
         max_stretch: largest ratio of the two largest scales. Needles go, flat discs stay: surfaces are made of them.
-        max_scale: largest standard deviation, m. None: a quarter of the body's size (diagonal between its 2 % and 98 %
-            quantiles), more than any piece of a body can be.
-        neighbours: a Gaussian with fewer neighbours than this, within three times the distance that holds eight nearby
-            (so that some seventy should be found there), is isolated and goes. 0: keep the lonely.
 
     Returns:
         Those left, in order, and the counts.
@@ -56,13 +53,11 @@ def prune(
     faint = ~broken & ~(g.opacities >= min_opacity)
     stretched = ~broken & ~faint & ~(stretch <= max_stretch)
     rest = ~(broken | faint | stretched)
-    if max_scale is None:
-        max_scale = 0.25 * body_size(g.means[rest])
-    huge = rest & (ordered[:, 2] > max_scale) & (max_scale > 0)
+    size = body_size(g.means[rest])
+    huge = rest & (ordered[:, 2] > LARGEST * size) & (size > 0)
     rest &= ~huge
     isolated = np.zeros(len(g), bool)
-    if neighbours > 0:
-        isolated[rest] = lonely(g.means[rest], neighbours)
+    isolated[rest] = lonely(g.means[rest])
     left = rest & ~isolated
     counts = (int(m.sum()) for m in (broken, faint, stretched, huge, isolated, left))
     return g.select(left), PruneReport(*counts)
@@ -81,13 +76,14 @@ def body_size(points: Float[np.ndarray, "n 3"]) -> float:
     return float(np.linalg.norm(np.ptp(np.quantile(points, [0.02, 0.98], axis=0), axis=0)))
 
 
-def lonely(points: Float[np.ndarray, "n 3"], neighbours: int = 4) -> Bool[np.ndarray, " n"]:
-    """Points with fewer than `neighbours` others within three times the distance at which the points nearby hold eight.
+def lonely(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Points with fewer than four others within three times the distance at which the points nearby hold eight.
 
-    The comparison is with the nearest eight points, so that a body may thin out with its distance from the camera.
+    Some seventy should be found there. The comparison is with the nearest eight points, so that a body may thin out
+    with its distance from the camera.
     """
     if len(points) < 10:
         return np.zeros(len(points), bool)
-    distances, others = nearest(points, points, max(neighbours, 8) + 1)
+    distances, others = nearest(points, points, 9)
     usual = np.median(distances[others[:, 1:9], 8], axis=1)
-    return distances[:, neighbours] > 3 * usual
+    return distances[:, 4] > 3 * usual

@@ -10,13 +10,23 @@ from jaxtyping import Float
 from fluidlift.errors import InputRejected
 from fluidlift.messages import NONE, Notice
 from fluidlift.shape.heights import HeightModel
-from fluidlift.types import FluidKind, MetricScale, PinholeCamera, RigidTransform, Similarity3, UpEvidence, kind_of
+from fluidlift.types import (
+    GRAVITY,
+    FluidKind,
+    MetricScale,
+    PinholeCamera,
+    RigidTransform,
+    Similarity3,
+    UpEvidence,
+    kind_of,
+)
 from fluidlift.types.hints import Ruler
 from fluidlift.types.kind import POUR
 
-STANDARD_GRAVITY = 9.81
-FEWEST_FALLING = 120
-"""points that a free fall is read from: fewer are one blur"""
+BANDS = 12
+"""of height, with equal numbers of points, that a free fall is read from"""
+FEWEST_FALLING = 10 * BANDS
+"""points of it: fewer are one blur"""
 LONGEST_FALL = 100.0
 SHORTEST_FALL = 0.02
 """m across the fluid, between which a scale from free fall is believed"""
@@ -80,7 +90,6 @@ def fit_free_fall(
     velocities: Float[np.ndarray, "n 3"],
     *,
     seen: VelocityEvidence | None = None,
-    bands: int = 12,
 ) -> FreeFall:
     """Acceleration of what falls, from v^2 = v0^2 + 2 g (z0 - z) (energy; no drag, no friction, steady in time).
 
@@ -94,19 +103,18 @@ def fit_free_fall(
         points: positions, any unit of length.
         velocities: in that unit per second, z up.
         seen: how.
-        bands: of height, with equal numbers of points.
     """
     seen = seen or VelocityEvidence()
     weight = np.ones(len(points)) if seen.trust is None else np.asarray(seen.trust, float)
     falls = _free_part(points[:, 2], velocities, weight)
-    if falls.sum() < max(FEWEST_FALLING, 10 * bands):
+    if falls.sum() < FEWEST_FALLING:
         return FreeFall(0.0, 0.0, 0.0, "too little of it falls")
     z = points[falls, 2] + 0.5 * seen.interval * velocities[falls, 2]
     moving, weight = velocities[falls], weight[falls]
-    edges = np.quantile(z, np.linspace(0.0, 1.0, bands + 1))
-    band = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, bands - 1)
-    filled = [k for k in range(bands) if (band == k).sum() >= 5]
-    if len(filled) < bands // 2 or edges[-1] <= edges[0]:
+    edges = np.quantile(z, np.linspace(0.0, 1.0, BANDS + 1))
+    band = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, BANDS - 1)
+    filled = [k for k in range(BANDS) if (band == k).sum() >= 5]
+    if len(filled) < BANDS // 2 or edges[-1] <= edges[0]:
         return FreeFall(0.0, 0.0, 0.0, "its fall spans too little height")
     drop = edges[-1] - z
     kept, given = np.ones(len(drop), bool), weight
@@ -274,7 +282,7 @@ def metric_scale(
         fall = fit_free_fall(points, velocities, seen=seen)
         refusal = fall.refusal
         if not refusal:
-            across = STANDARD_GRAVITY / fall.acceleration * extent
+            across = GRAVITY / fall.acceleration * extent
             if SHORTEST_FALL < across < LONGEST_FALL:
                 # the scale goes with the inverse of the acceleration: the relative errors are the same
                 lean = LEAN * np.tan(np.radians(abs(seen.pitch if seen else 0.0)))

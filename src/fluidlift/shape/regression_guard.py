@@ -77,12 +77,10 @@ def plain_color(image: np.ndarray, mask: np.ndarray, background: object) -> tupl
     return PLAIN_COLORS[int(np.argmax(distances))]
 
 
-def neighbours(
-    frame: LossFrame, gaussians: Gaussians, before: ShapeFigures, angles: tuple[float, ...] = NEIGHBOURS
-) -> list[LossFrame]:
+def neighbours(frame: LossFrame, gaussians: Gaussians, before: ShapeFigures) -> list[LossFrame]:
     """What the same frame would look like from the sides, by its depth before the refinement.
 
-    The camera turns about the middle of the body, left, right, up and down by each angle (degrees). Every pixel of the
+    The camera turns about the middle of the body, left, right, up and down by each of `NEIGHBOURS`. Every pixel of the
     new view takes the colour of the frame at the point that it shows; pixels whose point the frame does not show weigh
     nothing. A Gaussian that only paints the one view is wrong in all of these.
     """
@@ -90,7 +88,7 @@ def neighbours(
     middle = float(np.nanmedian(before.depth)) if np.isfinite(before.depth).any() else 1.0
     full = np.ones_like(frame.mask)
     out = []
-    for angle in angles:
+    for angle in NEIGHBOURS:
         for axis in ((0, angle), (0, -angle), (angle, 0), (-angle, 0)):
             turn = cv2.Rodrigues(np.radians([*axis, 0.0]))[0]
             center = np.array([0.0, 0.0, middle])

@@ -31,10 +31,9 @@ from fluidlift.shape.prism import (
     tallest,
     whole_piece,
 )
-from fluidlift.shape.registration import STANDARD_GRAVITY
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.shape.terrain import at_cells, to_corners, unit
-from fluidlift.types import CellType, Grid, MetricScale, PinholeCamera, Setting, Similarity3, Terrain, triple
+from fluidlift.types import GRAVITY, CellType, Grid, MetricScale, PinholeCamera, Setting, Similarity3, Terrain, triple
 
 STILL = 0.02
 """share of the outline's area that changes while the body is still held: noise of the mask"""
@@ -171,7 +170,7 @@ def standing_scale(
     front = speed()
     if front > 0:
         # s v_c = FRONT sqrt(g s h_c), for the scale s
-        value = (front / FRONT) ** -2 * STANDARD_GRAVITY * found.height
+        value = (front / FRONT) ** -2 * GRAVITY * found.height
         return MetricScale(value, "front", relative_error=FRONT_ERROR, across=value * across)
     return MetricScale(1.0 / across, "assumed", Notice("size-unknown", UNKNOWN_SIZE), across=1.0)
 

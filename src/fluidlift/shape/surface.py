@@ -306,15 +306,13 @@ def _axis(mask: np.ndarray, rows: np.ndarray, falls: np.ndarray) -> np.ndarray:
     return np.clip(line, line[falls].min(), line[falls].max())
 
 
-def intersect_height(
-    camera: PinholeCamera, model: HeightModel, near: float, far: float, *, samples: int = 96
-) -> Float[np.ndarray, "h w"]:
+def intersect_height(camera: PinholeCamera, model: HeightModel, near: float, far: float) -> Float[np.ndarray, "h w"]:
     """Camera depth where each pixel's ray first goes below a height model (0 where it never does)."""
     rays = camera.rays(camera.pixel_grid())
     eye = camera.position
     depth = np.zeros(rays.shape[:2])
     found = np.zeros(rays.shape[:2], bool)
-    steps = np.geomspace(near, far, samples)
+    steps = np.geomspace(near, far, 96)
     previous = steps[0]
     low, high = np.zeros_like(depth), np.zeros_like(depth)
     for z in steps[1:]:

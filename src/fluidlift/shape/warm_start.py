@@ -6,8 +6,6 @@ frame. Where the fluid has come to a place that the last frame did not show, the
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
@@ -15,7 +13,6 @@ from scipy import ndimage
 from fluidlift.errors import require
 from fluidlift.numerics.splatting import SplatCamera, bin_tiles, project, rasterize
 from fluidlift.seams import Rasterizer
-from fluidlift.shape.losses import LossWeights
 from fluidlift.shape.refine import RefineResult, refine
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians, concatenate
@@ -75,9 +72,7 @@ def follow(
     iterations: int = 10,
     seed: int = 0,
     max_gaussians: int = 60_000,
-    weights: LossWeights | None = None,
     rasterizer: Rasterizer | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> RefineResult:
     """`refine`, started from the frame before (see `carried`).
 
@@ -91,7 +86,7 @@ def follow(
     start = carried(last, fresh, mask, camera, motion=motion, depths=depths)
     return refine(
         start, image, mask, camera, iterations=iterations, seed=seed,
-        max_gaussians=max(max_gaussians, len(start)), weights=weights, rasterizer=rasterizer, progress=progress,
+        max_gaussians=max(max_gaussians, len(start)), rasterizer=rasterizer,
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
-from fluidlift.types import FaceVelocity, Grid
+from fluidlift.types import GRAVITY, FaceVelocity, Grid
 
 VectorField = Callable[[Float[np.ndarray, "*n 3"]], Float[np.ndarray, "*n 3"]]
 """m/s at positions in m"""
@@ -49,7 +49,7 @@ def taylor_green(
 
 
 def film_speed(
-    depth: Float[np.ndarray, "*n"], *, thickness: float, slope: float, viscosity: float, gravity: float = 9.81
+    depth: Float[np.ndarray, "*n"], *, thickness: float, slope: float, viscosity: float, gravity: float = GRAVITY
 ) -> Float[np.ndarray, "*n"]:
     """Speed (m/s) of a steady viscous film on a slope: the half-parabola of Nusselt (1916).
 
@@ -69,7 +69,7 @@ def film_speed(
 
 
 def tilted_channel(
-    *, thickness: float, slope: float, viscosity: float, gravity: float = 9.81, height: float = 0.0
+    *, thickness: float, slope: float, viscosity: float, gravity: float = GRAVITY, height: float = 0.0
 ) -> VectorField:
     """`film_speed` down a plane that falls along +x by `slope` (rad) and passes z = `height` (m) at x = 0."""
     along = np.array([np.cos(slope), 0.0, -np.sin(slope)])

@@ -16,10 +16,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from fluidlift.errors import require
 from fluidlift.synthetic.paint import Noise, to_picture
-from fluidlift.types import PinholeCamera, RigidTransform
+from fluidlift.types import GRAVITY, PinholeCamera, RigidTransform
 
-GRAVITY = 9.81
-"""m/s^2"""
 FRAME_RATE = 25.0
 """1/s"""
 CLUMP = 24

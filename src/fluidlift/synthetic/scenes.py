@@ -12,7 +12,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.numerics.isosurface import surface_nets
 from fluidlift.synthetic.paint import LiquidPaint, smoothstep
 from fluidlift.synthetic.surface import ScalarField
-from fluidlift.types import CellType, FluidParameters, Grid, Particles, PinholeCamera, Terrain, TriangleMesh
+from fluidlift.types import GRAVITY, CellType, FluidParameters, Grid, Particles, PinholeCamera, Terrain, TriangleMesh
 
 ColorShares = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 """shares of rock, of green and of wet at points (m) of the ground"""
@@ -219,7 +219,7 @@ def honey(*, size: tuple[int, int] = (288, 224), seed: int = 0, cells: int = 64)
     def shares(points: np.ndarray) -> np.ndarray:
         return np.zeros(points.shape)
 
-    mean = 9.81 * np.sin(angle) * thickness**2 / (3 * viscosity)
+    mean = GRAVITY * np.sin(angle) * thickness**2 / (3 * viscosity)
     positions, volume = _seeded(
         grid, solid, lambda p: (above(p) < thickness) & (np.abs(p[:, 1]) < 0.098), rng=np.random.default_rng(seed)
     )

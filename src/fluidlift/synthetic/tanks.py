@@ -17,10 +17,8 @@ from fluidlift.errors import require
 from fluidlift.physics.apic import LiquidSimulator
 from fluidlift.physics.rigid import RigidBody
 from fluidlift.synthetic.filling import PER_AXIS, between, inside, terrain_of, within
-from fluidlift.types import CellType, FluidParameters, Grid, Particles, Terrain
+from fluidlift.types import GRAVITY, CellType, FluidParameters, Grid, Particles, Terrain
 
-GRAVITY = 9.81
-"""m/s^2"""
 WATER, HONEY = 1e-6, 7e-3
 """kinematic viscosity, m^2/s"""
 
@@ -56,12 +54,6 @@ class Tank:
             taken |= within(body, self.particles.positions, 0.5 * self.grid.spacing)
         fill = self.fill * (1.0 - taken.sum() / max(len(taken), 1))
         return replace(self, bodies=self.bodies + bodies, particles=self.particles.select(~taken), fill=fill)
-
-    @property
-    def time_scale(self) -> float:
-        """s: sqrt(size / g); inf without gravity."""
-        pull = float(np.linalg.norm(self.parameters.gravity))
-        return float(np.sqrt(self.size / pull)) if pull > 0 else float("inf")
 
 
 def tank_of(

@@ -23,10 +23,8 @@ from fluidlift.physics.pressure import build_system
 from fluidlift.physics.rollout import RolloutParameters, flatten, rollout, unflatten
 from fluidlift.physics.rollout_domain import RolloutDomain, prepare_domain
 from fluidlift.physics.rollout_pressure import RolloutOptions
-from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid
+from fluidlift.types import GRAVITY, CellType, FaceVelocity, FluidParameters, Grid
 
-GRAVITY = 9.81
-"""m/s^2"""
 BLOB = 1.5
 """cells: standard deviation of the smooth noise whose lowest part is hidden"""
 SWEEPS = 5
@@ -224,12 +222,10 @@ def inflow_pattern(domain: RolloutDomain, rng: np.random.Generator) -> Float[np.
     return (out / math.sqrt(max(power, 1e-300))).astype(np.float32)
 
 
-def hidden_cells(
-    cell_types: np.ndarray, share: float, rng: np.random.Generator, blob: float = BLOB
-) -> Bool[np.ndarray, "nx ny nz"]:
+def hidden_cells(cell_types: np.ndarray, share: float, rng: np.random.Generator) -> Bool[np.ndarray, "nx ny nz"]:
     """The given share of the FLUID cells (to one cell), where smooth noise is lowest: blobs of a few cells."""
     fluid = cell_types == CellType.FLUID
-    field = ndimage.gaussian_filter(rng.standard_normal(cell_types.shape), blob, mode="wrap")
+    field = ndimage.gaussian_filter(rng.standard_normal(cell_types.shape), BLOB, mode="wrap")
     order = np.argsort(field[fluid])
     chosen = np.zeros(order.size, bool)
     chosen[order[: round(share * order.size)]] = True

@@ -34,7 +34,7 @@ from fluidlift.types.flow import PixelFlow, SaidFlow, SurfaceMotion
 from fluidlift.types.gaussians import SH_C0, Gaussians, concatenate, decompose_covariances, sh_from_rgb
 from fluidlift.types.grid import CellType, FaceVelocity, Grid, triple
 from fluidlift.types.kind import KINDS, FluidKind, kind_of
-from fluidlift.types.parameters import Estimate, FluidParameters
+from fluidlift.types.parameters import GRAVITY, Estimate, FluidParameters
 from fluidlift.types.particles import Particles
 from fluidlift.types.results import FitResult, SolveReport
 from fluidlift.types.terrain import Setting, Terrain, TriangleMesh
@@ -42,6 +42,7 @@ from fluidlift.types.transforms import RigidTransform, Similarity3, matrix_from_
 
 __all__ = [
     "FORMAT_VERSION",
+    "GRAVITY",
     "KINDS",
     "SH_C0",
     "BedEvidence",

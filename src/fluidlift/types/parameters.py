@@ -10,6 +10,9 @@ import numpy as np
 
 from fluidlift.errors import InputRejected, require
 
+GRAVITY = 9.81
+"""m/s^2, at the surface of the earth"""
+
 
 @dataclass(frozen=True)
 class FluidParameters:
@@ -21,7 +24,7 @@ class FluidParameters:
     """m^2/s"""
     surface_tension: float = 0.0
     """N/m; 0: none. It limits the time step (`surface_tension.capillary_time_step`)"""
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    gravity: tuple[float, float, float] = (0.0, 0.0, -GRAVITY)
     """m/s^2"""
     inflow_velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """m/s, bulk velocity at the inlet"""

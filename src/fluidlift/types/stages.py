@@ -241,16 +241,11 @@ class Refined:
     filled: int
     """Gaussians inside"""
     pruned: int
-    prune_report: str
-    """how many Gaussians went, and why; for whoever looks into the cache"""
     psnr_before: float | None = None
     """dB against the picture, before the refinement; None where nothing was refined"""
     psnr_after: float | None = None
     kept: bool = True
     """whether the refinement passed the guard of the depth"""
-    loss_history: tuple[float, ...] = ()
-    psnr_later: tuple[tuple[float, float], ...] = ()
-    """dB before and after, of the frames after the first"""
     warnings: tuple[Notice, ...] = ()
 
 

@@ -86,20 +86,17 @@ class Viewer:
     Args:
         folder: of the asset.
         request: where it is shown.
-        session: of edits; None: the asset's own.
         size: of the live preview; None: as this machine bears it.
 
     Raises: as `view_asset`.
     """
 
-    def __init__(
-        self, folder: Path, request: ViewRequest, session: Session | None = None, size: PreviewSize | None = None
-    ) -> None:
+    def __init__(self, folder: Path, request: ViewRequest, size: PreviewSize | None = None) -> None:
         require_viser()
         self.folder, self.request, self.lock = folder, request, threading.RLock()
         self.saved = SavedFrames(folder)
         self.asset = self.saved.asset
-        self.draft = Draft(session or open_session(folder), self.asset.parameters)
+        self.draft = Draft(open_session(folder), self.asset.parameters)
         self.controls = controls_of(self.asset.parameters, self.asset.kind, self.asset.estimates)
         self.cache: FrameCache[SplatFrame] = FrameCache(self._read)
         self.pictures: InputPictures | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,6 +26,9 @@ from fluidlift.types import (
     sh_from_rgb,
 )
 from fluidlift.types.stages import Flow, Geometry, Read, Refined, Segmentation
+
+if TYPE_CHECKING:
+    from fluidlift.shape.refine import RefineResult
 
 KEPT = 0.6
 """part of its size that a splat of the inside keeps at least: at 0.3 the first frame is a little cleaner, but once the
@@ -55,16 +59,6 @@ class _Seen:
     geometry: Geometry
     config: RefineSettings
     work: Work
-
-
-@dataclass(frozen=True)
-class _Refinement:
-    """How the first body came out of the refinement."""
-
-    psnr_before: float | None = None
-    psnr_after: float | None = None
-    kept: bool = True
-    loss_history: tuple[float, ...] = ()
 
 
 def refine(
@@ -98,7 +92,7 @@ def refine(
         behind = occluders.HiddenFluid.of(geometry.hidden, mask)
         fluid, frames, mask = fluid | behind.hidden, behind.pictures(frames), mask | behind.hidden
     seen = _Seen(frames, fluid, flow.flow.displacement, geometry, config, work)
-    made, fitted, later = _bodies(seen, bodies)
+    made, fitted = _bodies(seen, bodies)
     colours = generate.fluid_colour_frame(frames[start], fluid[start])
     hull = generate.hull_gaussians(colours, setting, camera, seed=config.seed)
     step = max(0.35 * h, 0.6 * c.stride * _pixel(depth, camera))
@@ -108,7 +102,7 @@ def refine(
     # what is seen is kept before what is hidden
     front = _bounded(front, int(0.75 * c.max_gaussians), config.seed)
     hull = _bounded(hull, c.max_gaussians - len(front), config.seed)
-    shown, pruned = prune(_outside_solid(front, setting), min_opacity=0.05, max_stretch=12.0)
+    shown, _ = prune(_outside_solid(front, setting), min_opacity=0.05, max_stretch=12.0)
     beyond, hull = continued(shown, _outside_solid(hull, setting), setting, camera)
     beyond = _bounded(_outside_solid(beyond, setting), c.max_gaussians - len(shown) - len(hull), config.seed)
     shell = concatenate([shown, beyond, hull])
@@ -136,10 +130,8 @@ def refine(
             f"the body of the fluid has only {len(body)} Gaussians", "more fluid in the picture",
             "check the mask in the report, or raise --max-size",
         )  # fmt: skip
-    return Refined(
-        body, len(front), len(hull), len(added), len(front) - len(shown), str(pruned), fitted.psnr_before,
-        fitted.psnr_after, fitted.kept, fitted.loss_history, later,
-    )  # fmt: skip
+    how = (None, None, True) if fitted is None else (fitted.psnr_before, fitted.psnr_after, fitted.kept)
+    return Refined(body, len(front), len(hull), len(added), len(front) - len(shown), *how)
 
 
 def _as_spray(inside: Gaussians, geometry: Geometry, seed: int) -> Gaussians:
@@ -160,10 +152,9 @@ def _later_colour(clip: VideoClip, fluid, start: int) -> np.ndarray:
     return (np.median(seen, axis=0) / 255.0).astype(np.float32)
 
 
-def _bodies(
-    seen: _Seen, given: GivenFile | None
-) -> tuple[list[Gaussians], _Refinement, tuple[tuple[float, float], ...]]:
-    """One body per united frame, each refined against its picture; those after the first start from the last."""
+def _bodies(seen: _Seen, given: GivenFile | None) -> tuple[list[Gaussians], RefineResult | None]:
+    """One body per united frame, each refined against its picture; those after the first start from the last. And how
+    the first came out of that."""
     from fluidlift.backends.gsplat_rasterizer import best_rasterizer
     from fluidlift.shape.prune import prune
 
@@ -178,20 +169,19 @@ def _bodies(
         bodies = [generate.front_gaussians(pictures[t], fluid[t], g.depth, g.camera, stride=stride) for t in frames]
     draws = best_rasterizer(seen.config.rasterizer, seen.work.warn)
     first, fitted = _refined(seen, bodies[0], draws)
-    later, likeness = _followed(seen, first, bodies[1:], frames[1:], draws)
-    return [first, *later], fitted, likeness
+    return [first, *_followed(seen, first, bodies[1:], frames[1:], draws)], fitted
 
 
 def _followed(
     seen: _Seen, last: Gaussians, bodies: list[Gaussians], frames: list[int], draws: Rasterizer
-) -> tuple[list[Gaussians], tuple[tuple[float, float], ...]]:
-    """Bodies of the frames after the first, each from the one before; and their likeness before and after, dB."""
+) -> list[Gaussians]:
+    """Bodies of the frames after the first, each from the one before."""
     from fluidlift.shape.warm_start import follow
 
     pictures, fluid, camera, c = seen.frames, seen.fluid, seen.geometry.camera, seen.config
     if c.refine_iterations == 0 or len(last) == 0:
-        return bodies, ()
-    depth, out, likeness = seen.geometry.depth, [], []
+        return bodies
+    depth, out = seen.geometry.depth, []
     for t, fresh in zip(frames, bodies, strict=True):
         if not fluid[t].any() or len(fresh) == 0:
             out.append(fresh)
@@ -203,25 +193,22 @@ def _followed(
         )  # fmt: skip
         last = generate.bounded_colours(found.gaussians, pictures[t], camera)
         out.append(last)
-        likeness.append((found.psnr_before, found.psnr_after))
-    return out, tuple(likeness)
+    return out
 
 
-def _refined(seen: _Seen, front: Gaussians, draws: Rasterizer) -> tuple[Gaussians, _Refinement]:
-    """A body optimised against the picture of the rest frame."""
+def _refined(seen: _Seen, front: Gaussians, draws: Rasterizer) -> tuple[Gaussians, RefineResult | None]:
+    """A body optimised against the picture of the rest frame, and how; None: as it was."""
     from fluidlift.shape.refine import refine as refine_view
 
     c, start, camera = seen.config, seen.geometry.rest_frame, seen.geometry.camera
     if c.refine_iterations == 0 or not len(front):
-        return front, _Refinement()
+        return front, None
     picture = seen.frames[start]
     found = refine_view(
         front, picture, seen.fluid[start], camera, iterations=c.refine_iterations, seed=c.seed,
         max_gaussians=max(int(1.5 * len(front)), 1000), rasterizer=draws, progress=seen.work.step,
     )  # fmt: skip
-    history = tuple(float(x) for x in found.loss_history)
-    how = _Refinement(found.psnr_before, found.psnr_after, found.kept, history)
-    return generate.bounded_colours(found.gaussians, picture, camera), how
+    return generate.bounded_colours(found.gaussians, picture, camera), found
 
 
 def _pixel(depth: np.ndarray, camera: PinholeCamera) -> float:

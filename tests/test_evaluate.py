@@ -2,6 +2,8 @@
 
 import json
 import os
+import struct
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -424,6 +426,25 @@ def test_a_damaged_file_is_rejected_by_name(tmp_path, name, content, word):
     folder = write_case(tmp_path / "pool")
     (folder / name).unlink() if content is None else (folder / name).write_text(content)
     with pytest.raises(InputRejected, match=word):
+        read_case(folder)
+
+
+def test_an_archive_that_numpy_cannot_take_is_rejected(tmp_path):
+    folder = write_case(tmp_path / "pool")
+    with zipfile.ZipFile(folder / "solids.npz") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    header = b"{'descr': '|u1', 'fortran_order': False, 'shape': (4611686018427387904,)}\n"
+    lying = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
+    for packing, others in ((zipfile.ZIP_LZMA, {}), (zipfile.ZIP_DEFLATED, {"bed_v.npy": lying})):
+        with zipfile.ZipFile(folder / "solids.npz", "w", packing) as archive:
+            for name, content in (members | others).items():
+                archive.writestr(name, content)
+        with pytest.raises(InputRejected, match=r"solids\.npz"):
+            read_case(folder)
+    data = bytearray((folder / "truth.npz").read_bytes())
+    data[200:260] = bytes(60)
+    (folder / "truth.npz").write_bytes(data)
+    with pytest.raises(InputRejected, match=r"truth\.npz"):
         read_case(folder)
 
 

@@ -1,11 +1,18 @@
 """A warning is a text that keeps its code on the way through the cache and between processes."""
 
+import io
 import json
 import pickle
 from dataclasses import dataclass
 
+import numpy as np
+from catalogue import write_clip
+
+from fluidlift.cli import main
+from fluidlift.errors import InputRejected
 from fluidlift.io.stage_codec import packed, unpacked
-from fluidlift.messages import Notice, as_plain, code_of, from_plain, without
+from fluidlift.messages import Notice, VisibleOutput, as_plain, code_of, from_plain, visible, without
+from fluidlift.progress import PlainProgress
 
 
 @dataclass(frozen=True)
@@ -54,3 +61,42 @@ def test_texts_for_files_are_plain():
     """A subclass of str is nothing that YAML knows."""
     (text,) = as_plain([Notice("dry", "no water")])["warnings"]
     assert type(text) is str and text == "no water"
+
+
+CLEARING = "a\x1b[2J\x1b]0;title\x07\x9b1A\r\u202eb"
+"""clears a terminal, sets its title, moves its cursor, and lets what follows read backwards"""
+SHOWN = r"a\x1b[2J\x1b]0;title\x07\x9b1A\r\u202eb"
+
+
+def test_what_would_command_a_terminal_is_spelled_out():
+    assert visible(CLEARING) == SHOWN
+    assert visible("a\tb\nü 水 😀") == "a\tb\nü 水 😀"
+    held = io.StringIO()
+    shown = VisibleOutput(held)
+    print(CLEARING, file=shown)
+    shown.writelines([CLEARING, "\n"])
+    assert held.getvalue() == f"{SHOWN}\n" * 2 and not shown.isatty()
+
+
+def test_names_of_strangers_command_no_terminal(tmp_path, capsys):
+    clip = tmp_path / "c\x1b[2J\u202e.mp4"
+    clip.write_bytes(b"")
+    assert main(["inspect", str(clip)]) == 3
+    write_clip(clip, np.zeros((4, 32, 48, 3), np.uint8))
+    assert main(["inspect", str(clip)]) in (0, 4)
+    said = capsys.readouterr()
+    for text in said:
+        assert r"c\x1b[2J\u202e.mp4" in text and "\x1b" not in text and "\u202e" not in text
+
+
+def test_warnings_with_words_of_strangers_command_no_terminal():
+    held = io.StringIO()
+    progress = PlainProgress(held)
+    progress.warn(CLEARING)
+    progress.say(CLEARING)
+    assert held.getvalue() == f"warning: {SHOWN}\n{SHOWN}\n"
+
+
+def test_a_question_ends_as_a_question():
+    assert str(InputRejected("no look 'a'", "b", "did you mean b?")).endswith("Do: did you mean b?")
+    assert str(InputRejected("no look 'a'", "b", "write b")).endswith("Do: write b.")

@@ -253,6 +253,12 @@ def test_a_scene_that_would_be_refused_is_told_before_it_is_simulated(folder, te
     assert words in finding.detail + finding.do
 
 
+def test_what_lies_outside_the_domain_is_no_scene_that_can_be_used(folder):
+    (folder / "scene.yaml").write_text("obstacles:\n  - {shape: sphere, position: [90, 0, 0], radius: 0.1}\n")
+    found = failed(folder)["scene.yaml can be used"]
+    assert "outside the domain" in found.detail and found.do
+
+
 def test_faults_of_the_usd_file_are_told(folder):
     from pxr import Usd
 

@@ -24,7 +24,7 @@ class InputRejected(FluidliftError):
         if needed:
             parts.append("Needed: " + needed.rstrip(".") + ".")
         if do:
-            parts.append("Do: " + do.rstrip(".") + ".")
+            parts.append("Do: " + do.rstrip(".") + "." * (not do.endswith("?")))
         super().__init__(" ".join(parts))
 
 

@@ -1,9 +1,10 @@
-"""What a person should know: a text, and a code by which programs tell it from other texts."""
+"""What a person should know: a text, and a code by which programs tell it from other texts; and texts for terminals."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, TextIO
 
 
 class Notice(str):
@@ -54,3 +55,41 @@ def from_plain(data: Mapping[str, Any]) -> list[Notice]:
     texts = [t for t in texts if isinstance(t, str)] if isinstance(texts, list) else []
     known = isinstance(codes, list) and len(codes) == len(texts) and all(isinstance(c, str) for c in codes)
     return [Notice(c, t) for c, t in zip(codes if known and isinstance(codes, list) else [""] * len(texts), texts)]
+
+
+_COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+"""characters that a terminal obeys instead of showing them, but for tabs and line breaks: they would clear it, change
+its title, fill the clipboard, or let a name read backwards"""
+
+
+def visible(text: str) -> str:
+    """A text with names and words of strangers, as a terminal may have it: what commands a terminal is spelled out."""
+    return _COMMANDS.sub(lambda c: c.group().encode("unicode_escape").decode("ascii"), text)
+
+
+class VisibleOutput:
+    """A stream that takes texts as `visible` shows them; in everything else it is the stream that it holds.
+
+    Args:
+        stream: such as standard output.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """How many characters were taken."""
+        self._stream.write(visible(text))
+        return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        """One after the other."""
+        for line in lines:
+            self.write(line)
+
+    def flush(self) -> None:
+        """Hand on what is buffered."""
+        self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)

@@ -9,6 +9,8 @@ import time
 from collections.abc import Iterator
 from typing import Any, TextIO
 
+from fluidlift.messages import visible
+
 LABELS = {
     "compile": "compiling",
     "window": "looking through the clip",
@@ -95,7 +97,7 @@ class PlainProgress:
 
     def say(self, text: str) -> None:
         """Something good to know."""
-        print(text, file=self.stream, flush=True)
+        print(visible(text), file=self.stream, flush=True)
 
     def stage(self, name: str, number: int, count: int) -> None:
         """A stage begins."""
@@ -120,7 +122,7 @@ class PlainProgress:
 
     def warn(self, text: str) -> None:
         """Something the user should know."""
-        print(f"warning: {text}", file=self.stream, flush=True)
+        print(visible(f"warning: {text}"), file=self.stream, flush=True)
 
 
 class BarProgress:
@@ -149,7 +151,7 @@ class BarProgress:
 
     def say(self, text: str) -> None:
         """Something good to know."""
-        self.console.print(text, markup=False, highlight=False)
+        self.console.print(visible(text), markup=False, highlight=False)
 
     def stage(self, name: str, number: int, count: int) -> None:
         """A stage begins."""
@@ -178,7 +180,7 @@ class BarProgress:
 
     def warn(self, text: str) -> None:
         """Something the user should know."""
-        self.console.print(f"warning: {text}", style="yellow", markup=False, highlight=False)
+        self.console.print(visible(f"warning: {text}"), style="yellow", markup=False, highlight=False)
 
 
 @contextlib.contextmanager

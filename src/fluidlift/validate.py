@@ -161,11 +161,13 @@ _ASSET_CHECKS: tuple[tuple[str, Callable[[FluidAsset], str | list[str]], str], .
 
 
 def _scene(folder: Path) -> Finding:
-    """Whether the file that people edit would be understood."""
+    """Whether the file that people edit would be understood, and simulated."""
     from fluidlift.io.scene import read_edits
+    from fluidlift.scene.edits import EditSession
 
     try:
         read_edits(folder)
+        EditSession(folder).warnings()  # refuses what lies outside, and what this kind of fluid cannot do
     except InputRejected as error:
         needed = f"; needed: {error.needed}" if error.needed else ""
         return Finding("scene.yaml can be used", False, error.got + needed, error.do or "correct the line")

@@ -58,6 +58,21 @@ def test_a_clip_is_looked_through_once(film, tmp_path, monkeypatch):
         parted([Shot(film, "film", {})], tmp_path, print)
 
 
+@pytest.mark.parametrize(
+    "parts",
+    [
+        "[" * 900 + "]" * 900, '[{"start": 0, "end": "x", "seconds": 1}]', '[{"start": NaN, "end": 2, "seconds": 1}]',
+        '[{"start": 0, "end": [], "seconds": 1}, 7]', '[[]]', '"ab"', '[{"start": 0, "end": 1e999, "seconds": 1}]',
+    ],
+)  # fmt: skip
+def test_a_damaged_file_of_cuts_is_as_none(film, tmp_path, parts):
+    shots = parted([Shot(film, "film", {})], tmp_path, lambda line: None)
+    (found,) = tmp_path.glob("*.cuts.json")
+    asked = json.dumps(json.loads(found.read_text())["asked"])
+    found.write_text(f'{{"asked": {asked}, "parts": {parts}}}')
+    assert parted([Shot(film, "film", {})], tmp_path, lambda line: None) == shots
+
+
 def test_a_plan_has_a_task_for_each_part(film, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["batch", str(film), "-o", str(out), "--shots", "auto", "--plan", "openjd"]) == 0

@@ -5,6 +5,7 @@ import io
 import json
 
 import numpy as np
+import pytest
 
 from fluidlift.cli import main
 from fluidlift.farm.page import doubt, page
@@ -74,3 +75,39 @@ def test_a_folder_that_is_none_is_refused(tmp_path, capsys):
     assert main(["batch", str(tmp_path), "--html", "-o", str(tmp_path)]) == 3
     assert main(["batch", str(tmp_path)]) == 3
     assert "-o" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"seconds": "long"}, {"seconds": None}, {"seconds": 1e999}, {"warnings": 3}, {"warnings": [3]}, {"reason": [1]},
+        {"verdict": {}}, {"peak_memory_mb": float("nan")}, {"version": 1}, {"name": "good"},
+    ],
+)  # fmt: skip
+def test_a_state_of_other_types_counts_as_none(tmp_path, changes):
+    folder = folder_of(tmp_path)
+    state = json.loads((folder / "poor.state.json").read_text()) | changes
+    (folder / "poor.state.json").write_text(json.dumps(state))
+    status = status_of(folder)
+    assert [o.name for o in status.outcomes] == ["good", "bad"] and "poor" in status.waiting
+    assert status.lines() and as_csv(status.outcomes) and page(folder, status)
+
+
+@pytest.mark.parametrize(
+    "listed", ["[" * 100_000, '{"a": ' * 900 + "1" + "}" * 900, json.dumps(["n" * 300]), "[7, null]"]
+)
+def test_a_damaged_list_of_names_leaves_what_is_known_of_the_shots(tmp_path, listed):
+    folder = folder_of(tmp_path)
+    (folder / "shots.json").write_text(listed)
+    assert sorted(o.name for o in status_of(folder).outcomes) == ["bad", "good", "poor"]
+    (folder / "poor.state.json").write_text("[" * 100_000)
+    assert status_of(folder).waiting == ("poor",)
+
+
+def test_pictures_of_one_column_become_no_millions_of_rows(tmp_path):
+    folder = folder_of(tmp_path)
+    asset = folder / "poor.fluid"
+    asset.mkdir()
+    write_png(asset / "mask_overlay.png", np.full((3000, 1, 3), 90, np.uint8))
+    text = page(folder, status_of(folder))
+    assert text.count("data:image/jpeg") == 1 and len(text) < 1e6

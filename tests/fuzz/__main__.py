@@ -2,8 +2,8 @@
 
 One process per target, two at a time; a table of what was found, and exit code 1 where something did not hold. Inputs
 that ended in something else than a refusal are kept. Of most inputs, bytes are changed; a share (`--formed`) keeps the
-form of its format, drawn with Hypothesis. `--guided SECONDS` lets Atheris lead, where it is installed. `--record`
-writes what was found down for docs/results.md.
+form of its format, drawn with Hypothesis, and another (`--borders`) is changed at borders of it.
+`--guided SECONDS` lets Atheris lead, where it is installed. `--record` writes what was found down for docs/results.md.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
-def tried(name: str, inputs: int, formed: int, seed: int, keep: str) -> dict[str, Any]:
+def tried(name: str, inputs: int, formed: int, borders: int, seed: int, keep: str) -> dict[str, Any]:
     """What a run of one target found; a process that died counts as one raw exception."""
     run = subprocess.run(
-        [sys.executable, "-m", "fuzz.trial", name, str(inputs - formed), str(formed), str(seed), keep],
+        [sys.executable, "-m", "fuzz.trial", name, str(inputs - formed - borders), str(formed),
+         str(borders), str(seed), keep],
         capture_output=True, text=True, env=environment(),
     )  # fmt: skip
     if run.returncode != 0:
@@ -63,7 +64,8 @@ def guided(names: list[str], seconds: int, keep: str) -> int:
 def figures(found: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """The records of one target for docs/results.md."""
     values = {
-        "inputs": found["inputs"], "of them formed": found["formed"], "refused": found["refused"],
+        "inputs": found["inputs"], "of them formed": found["formed"],
+        "changed at borders": found["bordered"], "refused": found["refused"],
         "tracebacks": sum(found["raw"].values()), "files opened outside": len(found["outside"]),
         "processor time": round(found["seconds"], 1), "slowest input": round(found["slowest"], 2),
         "memory": round(found["peak_bytes"] / 1e6),
@@ -77,7 +79,7 @@ def record(all_found: list[dict[str, Any]], command: str) -> None:
     from benchmarks.report import put
 
     ran = [found for found in all_found if "inputs" in found]
-    whole = {n: sum(f[n] for f in ran) for n in ("inputs", "formed", "refused", "seconds")}
+    whole = {n: sum(f[n] for f in ran) for n in ("inputs", "formed", "bordered", "refused", "seconds")}
     whole |= {"raw": {f["target"]: sum(f["raw"].values()) for f in all_found}}
     whole |= {"outside": [name for f in ran for name in f["outside"]], "target": ALL}
     whole |= {n: max(f[n] for f in ran) for n in ("slowest", "peak_bytes")}
@@ -91,6 +93,7 @@ def main() -> int:
     parser.add_argument("--inputs", type=int, default=100_000, help="of each target")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--formed", type=float, default=0.1, help="share of them that keeps its form")
+    parser.add_argument("--borders", type=float, default=0.1, help="share of them that is changed at borders of it")
     parser.add_argument("--guided", type=int, metavar="SECONDS", help="of each target, led by Atheris, instead")
     parser.add_argument("--record", action="store_true", help="write the figures for docs/results.md")
     parser.add_argument("--keep", default="", help="folder for inputs that were neither read nor refused")
@@ -101,10 +104,13 @@ def main() -> int:
     keep = str(Path(asked.keep).absolute()) if asked.keep else ""
     if asked.guided:
         return guided(asked.targets or list(TARGETS), asked.guided, keep)
-    whole, formed, all_found = True, round(asked.inputs * asked.formed), list[dict[str, Any]]()
+    whole, all_found = True, list[dict[str, Any]]()
+    formed, borders = round(asked.inputs * asked.formed), round(asked.inputs * asked.borders)
     print(f"{'target':14} {'inputs':>8} {'refused':>8} {'s':>8} {'slowest s':>10} {'peak MB':>8}")
     with ThreadPoolExecutor(2) as pool:
-        jobs = pool.map(lambda name: tried(name, asked.inputs, formed, asked.seed, keep), asked.targets or TARGETS)
+        jobs = pool.map(
+            lambda name: tried(name, asked.inputs, formed, borders, asked.seed, keep), asked.targets or TARGETS
+        )
         for found in jobs:
             all_found.append(found)
             if "inputs" in found:

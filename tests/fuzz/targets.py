@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -13,39 +12,12 @@ import yaml
 from fluidlift.errors import InputRejected
 
 from . import corpus
+from .beside import BESIDE
 from .corpus import Seed
+from .target import Target, texts
 
 SIZE = (48, 32)
 """px of the clips that the files belong to"""
-
-
-@dataclass(frozen=True)
-class Target:
-    """One reader."""
-
-    seeds: Callable[[], list[Seed]]
-    read: Callable[[Path], object]
-    """gets the folder that the file is in"""
-    name: str
-    """of the file in that folder"""
-    beside: Callable[[], dict[str, bytes]] = field(default=dict)
-    """what else lies in the folder"""
-    slow: bool = False
-    """takes milliseconds or more: fewer inputs in a run of all tests"""
-
-    def seed(self, number: int) -> Seed:
-        """One of the sound files, or what is in it."""
-        seeds = _made(self.seeds)
-        return seeds[number % len(seeds)]
-
-
-@cache
-def _made(seeds: Callable[[], list[Seed]]) -> list[Seed]:
-    return seeds()
-
-
-def _text(*texts: bytes) -> Callable[[], list[Seed]]:
-    return lambda: [Seed(text) for text in texts]
 
 
 def _scene(folder: Path) -> None:
@@ -326,15 +298,15 @@ _KEYS = (
 )
 
 TARGETS: dict[str, Target] = {
-    "yaml": Target(_text(corpus.SCENE, corpus.SETTINGS), _yaml, "a.yaml"),
-    "scene": Target(_text(corpus.SCENE, corpus.TEMPLATE), _scene, "scene.yaml", lambda: {"a.obj": corpus.OBJ}),
-    "scene-edited": Target(_text(corpus.SCENE, corpus.TEMPLATE), _edited, "scene.yaml", slow=True),
-    "settings": Target(_text(corpus.SETTINGS), _settings, "a.yaml"),
-    "values": Target(_text(b"3", b"[0, 0, -9.81]", b"fit.max_seconds=60"), _values, "value.txt"),
-    "shots": Target(_text(corpus.SHOTS), _shots, "shots.yaml"),
-    "camera": Target(_text(_CAMERA, _TRANSFORMS), _camera, "a.json"),
-    "distortion": Target(_text(_CAMERA), _distortion, "a.json"),
-    "view": Target(_text(_CAMERA, _KEYS), _view, "a.json"),
+    "yaml": Target(texts(corpus.SCENE, corpus.SETTINGS), _yaml, "a.yaml"),
+    "scene": Target(texts(corpus.SCENE, corpus.TEMPLATE), _scene, "scene.yaml", lambda: {"a.obj": corpus.OBJ}),
+    "scene-edited": Target(texts(corpus.SCENE, corpus.TEMPLATE), _edited, "scene.yaml", slow=True),
+    "settings": Target(texts(corpus.SETTINGS), _settings, "a.yaml"),
+    "values": Target(texts(b"3", b"[0, 0, -9.81]", b"fit.max_seconds=60"), _values, "value.txt"),
+    "shots": Target(texts(corpus.SHOTS), _shots, "shots.yaml"),
+    "camera": Target(texts(_CAMERA, _TRANSFORMS), _camera, "a.json"),
+    "distortion": Target(texts(_CAMERA), _distortion, "a.json"),
+    "view": Target(texts(_CAMERA, _KEYS), _view, "a.json"),
     "manifest": Target(_part("manifest.json"), _asset, "manifest.json", corpus.asset_parts, slow=True),
     "parameters": Target(_part("parameters.json"), _asset, "parameters.json", corpus.asset_parts, slow=True),
     "asset-camera": Target(_part("rest/camera.json"), _asset, "rest/camera.json", corpus.asset_parts, slow=True),
@@ -344,8 +316,8 @@ TARGETS: dict[str, Target] = {
     "packed-frames": Target(corpus.packed, _validated, "frames/splats/1001.flsp", _frame_parts, slow=True),
     "force": Target(_force_files, _force, "rest/force.npz"),
     "history": Target(_history_files, _history, "edits/history.jsonl"),
-    "obj": Target(_text(corpus.OBJ), _mesh("a.obj"), "a.obj", _beside_obj),
-    "mtl": Target(_text(corpus.MTL), _mesh("a.obj"), "a.mtl", _beside_obj),
+    "obj": Target(texts(corpus.OBJ), _mesh("a.obj"), "a.obj", _beside_obj),
+    "mtl": Target(texts(corpus.MTL), _mesh("a.obj"), "a.mtl", _beside_obj),
     "glb": Target(corpus.glb, _mesh("a.glb"), "a.glb"),
     "mesh-ply": Target(corpus.mesh_plys, _mesh("a.ply"), "a.ply"),
     "splats": Target(corpus.splats, _splats, "a.ply"),
@@ -367,5 +339,5 @@ TARGETS: dict[str, Target] = {
     "stage-arrays": Target(_stage_part("work/flow/k.npz"), _stage, "work/flow/k.npz", _stage_files),
     "stage-mapped": Target(_stage_part("work/flow/k.long.npy"), _stage, "work/flow/k.long.npy", _stage_files),
     "video": Target(corpus.videos, _video, "a.mp4", slow=True),
-    "usd-checked": Target(_text(corpus.USDA), _usd_checked, "a.usda", slow=True),
-}
+    "usd-checked": Target(texts(corpus.USDA), _usd_checked, "a.usda", slow=True),
+} | BESIDE

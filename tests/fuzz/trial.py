@@ -8,6 +8,7 @@ import os
 import resource
 import shutil
 import signal
+import struct
 import sys
 import sysconfig
 import tempfile
@@ -22,8 +23,10 @@ from typing import Any
 from fluidlift.errors import FluidliftError
 from fluidlift.io.confined import reading_here
 
-from .mutation import KINDS, Edit, mutated
-from .targets import TARGETS, Target
+from .borders import changed
+from .mutation import KINDS, LONGEST, Edit, mutated
+from .target import Target
+from .targets import TARGETS
 
 SLOWEST, LARGEST = 20.0, 2 * 2**30
 """s and bytes of memory that no input may take"""
@@ -103,6 +106,15 @@ def drawn(target: Target, random: Random) -> bytes:
     return seed.pack(mutated(seed.data, edits))
 
 
+def bordered(target: Target, random: Random) -> bytes:
+    """One that is changed at a border of its format."""
+    seed, other = target.seed(random.randrange(1000)), target.seed(random.randrange(1000))
+    try:
+        return seed.pack(changed(seed.data, other.pack(other.data), random))[:LONGEST]
+    except (ValueError, OverflowError, struct.error):  # what is inside of a packed file no longer packs
+        return drawn(target, random)
+
+
 @dataclass
 class Found:
     """What a run of one target found."""
@@ -111,6 +123,8 @@ class Found:
     inputs: int = 0
     formed: int = 0
     """of the inputs, those that keep the form of their format"""
+    bordered: int = 0
+    """and those that are changed at a border of it"""
     accepted: int = 0
     refused: int = 0
     seconds: float = 0.0
@@ -131,13 +145,16 @@ def place_of(error: BaseException) -> str:
     return f"{type(error).__name__}{where}: {str(error)[:120]}"
 
 
-def run_target(name: str, inputs: int, seed: int, keep: Path | None = None, *, formed: int = 0) -> Found:
+def run_target(
+    name: str, inputs: int, seed: int, keep: Path | None = None, *, formed: int = 0, borders: int = 0
+) -> Found:
     """Many inputs of one target, in this process.
 
     Args:
         name: of the target.
         inputs: how many of which bytes are changed.
         seed: of what is drawn.
+        borders: how many more that are changed at borders of the format.
         formed: how many more that keep the form of their format, drawn with Hypothesis.
         keep: folder for the inputs that ended in something else than a refusal.
     """
@@ -157,9 +174,13 @@ def run_target(name: str, inputs: int, seed: int, keep: Path | None = None, *, f
             folder.read(TARGETS[name].seed(0).pack(TARGETS[name].seed(0).data))
         for _ in range(inputs):
             _one(folder, drawn(TARGETS[name], random), found, watched, keep)
+        elsewhere = Random(f"{name} {seed} borders")
+        for _ in range(borders):
+            _one(folder, bordered(TARGETS[name], elsewhere), found, watched, keep)
+        found.bordered = borders
         if formed:
             _draw_formed(folder, formed, f"{name} {seed}", lambda data: _one(folder, data, found, watched, keep))
-            found.formed = found.inputs - inputs
+            found.formed = found.inputs - inputs - borders
     finally:
         shutil.rmtree(place, ignore_errors=True)
     found.peak_bytes = peak_memory()
@@ -206,11 +227,13 @@ def _tried(folder: Folder, data: bytes, found: Found, watched: Watched, keep: Pa
 
 
 def main() -> None:
-    """Run one target in a process of its own: name, inputs, formed inputs, seed and folder to keep in; figures as JSON
-    on stdout."""
-    name, inputs, formed, seed, keep = sys.argv[1:6]
+    """Run one target in a process of its own: name, inputs, formed and bordered inputs, seed and folder to keep in;
+    figures as JSON on stdout."""
+    name, inputs, formed, borders, seed, keep = sys.argv[1:7]
     resource.setrlimit(resource.RLIMIT_AS, (24 * 2**30, 24 * 2**30))
-    found = run_target(name, int(inputs), int(seed), Path(keep) if keep else None, formed=int(formed))
+    found = run_target(
+        name, int(inputs), int(seed), Path(keep) if keep else None, formed=int(formed), borders=int(borders)
+    )
     print("\n" + json.dumps(vars(found)))
 
 

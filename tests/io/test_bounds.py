@@ -19,7 +19,7 @@ from fluidlift.io.array_archive import mapped_array, release_pages
 from fluidlift.io.confined import reading_here
 from fluidlift.io.exr import channels_in
 from fluidlift.io.images import read_depth
-from fluidlift.io.limits import ReadLimits, parse_json
+from fluidlift.io.limits import MAX_DEPTH, ReadLimits, parse_json
 from fluidlift.io.picture_headers import picture_header
 from fluidlift.io.pictures import picture_in, read_picture
 from fluidlift.io.read_mesh import read_any_mesh
@@ -223,6 +223,12 @@ def test_numbers_of_json_that_no_reader_can_mean_are_infinite():
     ]  # fmt: skip
     with pytest.raises(ValueError, match="nested"):
         parse_json("[" * 100_000)
+    for depth, text in ((101, "[" * 101 + "]" * 101), (400, '{"a": ' * 400 + "1" + "}" * 400)):  # which Python reads
+        assert json.loads(text)
+        with pytest.raises(ValueError, match="nested too deeply"):
+            parse_json(text)
+        assert depth > MAX_DEPTH
+    assert parse_json("[" * MAX_DEPTH + "]" * MAX_DEPTH) and parse_json("[" + "[]," * 500 + "[]]")
     with pytest.raises(ValueError, match="surrogates"):
         parse_json(r'{"name": ["a\ud800"]}')
     assert parse_json(r'"\ud83d\ude00"') == "\U0001f600"  # a whole pair

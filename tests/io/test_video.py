@@ -266,6 +266,14 @@ def test_limits_name_the_option_that_raises_them(make_video):
     rejected(make_video(), "--max-bytes", limits=ReadLimits(max_bytes=20000))
 
 
+def test_an_asset_in_the_place_of_a_clip_is_told_to_be_one(tmp_path):
+    for name in ("manifest.json", "scene.yaml"):
+        (tmp_path / name).write_text("{}")
+    write_png(tmp_path / "mask_overlay.png", np.zeros((8, 8, 3), np.uint8))
+    with pytest.raises(InputRejected, match=r"is an asset, not a clip\..*fluidlift view"):
+        read_clip(tmp_path, fps=25.0)
+
+
 def test_a_folder_without_pictures_is_refused(tmp_path):
     rejected(tmp_path, "holds no pictures", fps=25)
 

@@ -277,6 +277,19 @@ def test_the_vertical_of_a_generator_counts_only_where_it_knows_it(folder):
     assert up_of(folder, clip, "pour", 4, (96, 64)) == clip
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"frames": []}, {"frames": ["a", 1]}, {"frames": 3.5}, {"frames": [-1]}, {"frames": [True]}, {"frames": None},
+        {"metric": "no"}, {"knows_up": 1},
+    ],
+)  # fmt: skip
+def test_a_note_that_no_generator_wrote_is_refused(folder, changes):
+    write_json(folder / NOTE, json.loads((folder / NOTE).read_text()) | changes)
+    with pytest.raises(InputRejected, match="not what a generator wrote"):
+        given_bodies(folder, (96, 64), [4])
+
+
 @pytest.mark.parametrize(("tilt", "stands"), [(0, False), (20, False), (70, True), (90, True)])
 def test_a_stream_that_a_generator_set_on_edge_is_not_believed(folder, tilt, stands):
     """A sheet 1 x 1 x 0.05 turned about x; a pour may stand as it likes."""

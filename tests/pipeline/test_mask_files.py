@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
-from fluidlift.errors import MissingPackage
+from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.io.kept_values import kept_value
 from fluidlift.io.pictures import read_picture, write_png
 from fluidlift.motion import optical_flow
+from fluidlift.pipeline.mask_facts import MASK_FACTS, require_unchanged
 from fluidlift.pipeline.stages import flow
 from fluidlift.types import PinholeCamera
 from fluidlift.types.stages import Segmentation
@@ -164,3 +165,11 @@ def test_a_missing_package_leaves_no_folder_behind(stream_clip, tmp_path, monkey
     code = main(["mask", str(stream_clip), "-o", str(tmp_path / "out"), "--set", "motion.method=raft"])
     assert code == 1 and "torchvision" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("frames", [10**12, -1, 3.5, "7", None, [1], True])
+def test_facts_of_masks_with_another_number_of_frames_say_that_something_was_changed(copy, frames):
+    facts = json.loads((copy / "mask" / MASK_FACTS).read_text())
+    (copy / "mask" / MASK_FACTS).write_text(json.dumps(facts | {"frames": frames}))
+    with pytest.raises(InputRejected, match="were changed"):
+        require_unchanged(copy / "mask", "masks")

@@ -81,3 +81,10 @@ def test_the_mean_motion_of_the_clip_stands_by(finished):
 
 def test_the_film_is_a_wall_that_can_be_chosen():
     assert options("motion.wall=film").wall == "film"
+
+
+def test_what_is_taken_for_waves_is_said_of_a_fountain_as_of_its_pool():
+    reports = [{"frame": 0, "observed_share": 0.5, "circulating": 0.1}]
+    (sea,), (fountain,) = (motion_warnings(reports, kind, 0.0) for kind in ("basin", "fountain"))
+    assert "over the basin is taken for waves" in sea and "calm but for that, and" in sea
+    assert "over the pool of the fountain is" in fountain and "but for that and what falls into it, and" in fountain

@@ -219,9 +219,9 @@ def test_a_body_that_moves_on_has_not_collapsed():
 def test_a_kind_that_is_unsure_is_told_with_the_next_one():
     sure = KindEvidence("fall", {"fall": 0.8, "stream": 0.15, "pour": 0.05}, {})
     torn = KindEvidence("fall", {"stream": 0.4, "fall": 0.5, "pour": 0.1}, {})
-    assert doubts(sure) == ()
-    (told,) = doubts(torn)
-    assert "fall (0.50) or stream (0.40)" in told and "--kind" in told
+    assert doubts(sure, "fall") == ()
+    (told,) = doubts(torn, "stream")
+    assert "fall (0.50) or stream (0.40)" in told and "built as stream, and --kind decides" in told
 
 
 def test_beliefs_are_shares_and_the_kind_has_the_largest():

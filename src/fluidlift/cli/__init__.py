@@ -48,7 +48,7 @@ from fluidlift.cli.view import View
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.farm.guard import end_with_parent
 from fluidlift.kernels import compiling_beside
-from fluidlift.messages import as_plain
+from fluidlift.messages import VisibleOutput, as_plain, visible
 from fluidlift.progress import Interrupted, interrupted, shown_progress
 
 __all__ = ["main"]
@@ -138,12 +138,13 @@ def _run(args: list[str]) -> int:
             config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitSubcommandPrefixes),
         )
     try:
-        return _COMMANDS[type(command)](command)
+        with contextlib.redirect_stdout(VisibleOutput(sys.stdout)):
+            return _COMMANDS[type(command)](command)
     except InputRejected as error:
-        print(f"fluidlift: {error}", file=sys.stderr)
+        print(f"fluidlift: {visible(str(error))}", file=sys.stderr)
         return REJECTED
     except FluidliftError as error:
-        print(f"fluidlift: {error}", file=sys.stderr)
+        print(f"fluidlift: {visible(str(error))}", file=sys.stderr)
         return FAILED
     except KeyboardInterrupt:
         print(
@@ -154,7 +155,7 @@ def _run(args: list[str]) -> int:
     except BrokenPipeError:
         raise
     except Exception as error:
-        print(failure_line(error, args), file=sys.stderr)
+        print(visible(failure_line(error, args)), file=sys.stderr)
         return FAILED
 
 
@@ -493,7 +494,9 @@ def _evaluate_as_filmed(c: Evaluate) -> int:
     if c.clip is None:
         card = card_of(manifest)
         if isinstance(card, str):
-            raise InputRejected(f"'{c.asset.name}' was not held against its clip", "frames as they were filmed", card)
+            why, _, do = card.rpartition(": ")  # such as "the scene is edited (loop): run ..."
+            what = f"'{c.asset.name}' was not held against its clip" + f": {why}" * bool(why)
+            raise InputRejected(what, "frames as they were filmed", do)
     else:
         with shown_progress() as progress:
             card = card_against(c.asset, c.clip, start=c.start or 0.0, progress=progress)

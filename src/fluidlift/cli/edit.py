@@ -207,15 +207,17 @@ def _lines(session: EditSession, command: Edit, told: dict[str, Any], nothing: b
         lines += ["no edits yet"] * (not edits)
     if command.diff or not (told["edit"] or nothing or command.history or command.simulate):
         lines.append(session.diff().rstrip("\n") or "nothing differs from the fluid as lifted")
-    return lines + [f"warning: {text}" for text in told["warnings"]] + _next(session.folder, told["stale"])
+    lines += [f"warning: {text}" for text in told["warnings"]]
+    return lines + _next(session.folder, told["stale"], told["edit"])
 
 
-def _next(folder: Path, stale: list[str] | None) -> list[str]:
-    """What has become stale, and what to run."""
+def _next(folder: Path, stale: list[str] | None, edit: Any) -> list[str]:
+    """What has become stale, by an edit or before it, and what to run."""
     if stale is None:
         return [f"whether the frames on disk show this scene: fluidlift edit {_quoted(folder)}"]
     if "simulate" in stale:
-        return ["the frames on disk show another scene; next:", f"  fluidlift sim {_quoted(folder)}"]
+        other = "" if edit else ", or another version of fluidlift simulated them"
+        return [f"the frames on disk show another scene{other}; next:", f"  fluidlift sim {_quoted(folder)}"]
     if "look" in stale:
         film = _quoted(Path(folder.stem + ".mp4"))
         return ["only the look is another one, and nothing has to be simulated again; next:",

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from fluidlift.cli.options import Make
 from fluidlift.config import ReadConfig
 from fluidlift.errors import FluidliftError, InputRejected
+from fluidlift.messages import visible
 
 if TYPE_CHECKING:
     from fluidlift.farm.shots import Shot
@@ -61,7 +62,7 @@ def _code_of(shot: Shot, wanted: Make, out: Path, make_one: Callable[[Make], int
     try:
         return make_one(replace(wanted, out=out, part=part, settings=replace(wanted.settings, set=rest)))
     except FluidliftError as error:
-        print(f"fluidlift: {out.name}: {error}", file=sys.stderr)
+        print(visible(f"fluidlift: {out.name}: {error}"), file=sys.stderr)
         return 3 if isinstance(error, InputRejected) else 1
 
 

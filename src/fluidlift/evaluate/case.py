@@ -16,11 +16,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.array_archive import DAMAGE, IN_MEMORY, array_in, members_of
 from fluidlift.io.limits import parse_json
 from fluidlift.types import Grid, PinholeCamera, TriangleMesh
 
 LARGEST_BYTES = 4 << 30
 """unpacked size of one npz that is still read"""
+LARGEST_SMALL = 1 << 30
+"""bytes of its arrays that are held in memory"""
 
 SMOKE_SHARE = 0.05
 """a cell of a gas counts as occupied above this share of the largest density"""
@@ -109,12 +112,12 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            unpacked = sum(item.file_size for item in archive.infolist())
-        if unpacked > LARGEST_BYTES:
-            raise InputRejected(f"'{path.name}' unpacks to {unpacked} bytes", f"at most {LARGEST_BYTES}")
-        with np.load(path, allow_pickle=False) as data:
-            return {name: data[name] for name in data.files}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+            members = members_of(archive, LARGEST_BYTES)
+            small = sum(item.file_size for item in members.values() if item.file_size <= IN_MEMORY)
+            if small > LARGEST_SMALL:  # larger ones are mapped, and take no memory
+                raise ValueError(f"small arrays of {small} bytes in all")
+            return {name: array_in(archive, item) for name, item in members.items()}
+    except DAMAGE as error:
         raise InputRejected(
             f"'{path.name}' cannot be read ({type(error).__name__}: {error})", "an npz of plain arrays"
         ) from None

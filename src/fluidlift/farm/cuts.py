@@ -7,6 +7,7 @@ there; they go through a file, so that memory does not grow with the clip.
 from __future__ import annotations
 
 import json
+import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -18,6 +19,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.farm.shots import Shot
 from fluidlift.io.atomic import atomic_write
 from fluidlift.io.hashes import digest
+from fluidlift.io.limits import parse_json
 
 FOUND = ".cuts.json"
 """suffix of a file beside the assets: where a clip is cut, so that it is looked through once"""
@@ -84,16 +86,25 @@ def _parts_of(shot: Shot, folder: Path | None) -> list[Cut]:
     path = folder / f"{shot.name}{FOUND}"
     asked = {"clip": digest(shot.clip) if shot.clip.is_file() else "", "span": {k: str(v) for k, v in span.items()}}
     if asked["clip"]:
-        with suppress(OSError, ValueError, TypeError, KeyError):
-            kept = json.loads(path.read_bytes())
+        with suppress(OSError, ValueError, TypeError, KeyError, IndexError):
+            kept = parse_json(path.read_bytes())
             if kept["asked"] == asked:
-                return [Cut(float(c["start"]), c["end"], float(c["seconds"])) for c in kept["parts"]]
+                return [_cut(c) for c in kept["parts"]]
     parts = _looked_for(shot.clip, span)
     if not parts:
         return parts
     with atomic_write(path) as file:
         file.write((json.dumps({"asked": asked, "parts": [vars(part) for part in parts]}, indent=1) + "\n").encode())
     return parts
+
+
+def _cut(kept: Mapping[str, Any]) -> Cut:
+    """A part as a file has it; raises ValueError, TypeError or KeyError for what is none."""
+    end = None if kept["end"] is None else float(kept["end"])
+    cut = Cut(float(kept["start"]), end, float(kept["seconds"]))
+    if not all(math.isfinite(x) for x in (cut.start, cut.end or 0.0, cut.seconds)):
+        raise ValueError(f"times {cut}")
+    return cut
 
 
 def _looked_for(clip: Path, span: Mapping[str, Any]) -> list[Cut]:

@@ -15,6 +15,8 @@ from fluidlift.farm.summary import Status
 
 WIDTH = 240
 """px of a thumbnail: two side by side are judged at a glance, and a thousand shots take some 20 MB"""
+TALLEST = 4
+"""times as high as wide, at most: a picture of one column would become millions of rows"""
 _DOUBT = {"good": 0.0, "usable": 1.0, "": 1.5, "does not hold": 2.0}
 """by the verdict; a shot that failed has 3, and each warning adds a tenth"""
 _STYLE = """
@@ -91,7 +93,7 @@ def _preview(asset: Path) -> np.ndarray | None:
                 last = frame
     except (InputRejected, OSError):
         return None
-    if last is None:
+    if last is None or last.width < 3:
         return None
     picture = last.to_ndarray(format="rgb24")
     return picture[:, picture.shape[1] // 3 : 2 * (picture.shape[1] // 3)]
@@ -100,7 +102,7 @@ def _preview(asset: Path) -> np.ndarray | None:
 def _jpeg(picture: np.ndarray) -> str:
     import cv2
 
-    height = max(round(picture.shape[0] * WIDTH / picture.shape[1]), 1)
+    height = min(max(round(picture.shape[0] * WIDTH / picture.shape[1]), 1), TALLEST * WIDTH)
     small = cv2.resize(np.ascontiguousarray(picture[..., :3]), (WIDTH, height), interpolation=cv2.INTER_AREA)
     data: Sequence[int] = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 75])[1].tobytes()
     return "data:image/jpeg;base64," + base64.b64encode(bytes(data)).decode()

@@ -20,6 +20,8 @@ VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".m
 LISTS = (".yaml", ".yml")
 NOTES = ("licence", "source")
 """keys of a row that say where its clip is from"""
+LONGEST_NAME = 240
+"""bytes of a shot's name: file systems take 255, and files beside the asset add up to eleven (`.state.json`)"""
 _SHARD = re.compile(r"([1-9][0-9]{0,6})/([1-9][0-9]{0,6})", re.ASCII)
 
 
@@ -130,7 +132,8 @@ def _videos(folder: Path) -> list[Path]:
 
 def is_name(text: str) -> bool:
     """Whether files can be called so, on any system, and none outside their folder is meant."""
-    return bool(text) and not text.startswith((".", "-")) and not any(c in text for c in '/\\:*?"<>|\0')
+    short = len(text.encode("utf-8", "surrogatepass")) <= LONGEST_NAME
+    return bool(text) and short and not text.startswith((".", "-")) and not any(c in text for c in '/\\:*?"<>|\0')
 
 
 def _require_names(shots: Iterable[Shot]) -> None:

@@ -8,6 +8,7 @@ shot's lock makes it.
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -19,6 +20,7 @@ from fluidlift.farm.shots import is_name
 from fluidlift.io.asset_lock import held, held_file
 from fluidlift.io.atomic import atomic_write
 from fluidlift.io.hashes import digest
+from fluidlift.io.limits import parse_json
 
 STATE, LOCK, LOG = ".state.json", ".lock", ".log"
 """suffixes of a shot's files, beside NAME.fluid"""
@@ -27,6 +29,9 @@ LISTED = "shots.json"
 WELL = ("done", "done, warnings")
 LARGEST = 1 << 20
 """bytes of a state file that are read: warnings are some hundred characters each"""
+
+LARGEST_LIST = 16 * LARGEST
+"""bytes of a list of names that are read: a hundred thousand shots"""
 
 
 @dataclass(frozen=True)
@@ -88,11 +93,26 @@ def read_outcome(folder: Path, name: str) -> ShotOutcome | None:
 def parsed_outcome(data: bytes, name: str) -> ShotOutcome | None:
     """What a state file says of a shot; None of one that is damaged, or of another shot."""
     with suppress(ValueError, TypeError, KeyError):
-        found = json.loads(data)
-        known = {f.name: type(f.default) for f in fields(ShotOutcome)}
-        if found["name"] == name and all(isinstance(found[k], str) for k in ("outcome", "failure", "fingerprint")):
-            return ShotOutcome(**{k: v for k, v in found.items() if k in known})
+        found = parse_json(data)
+        outcome = ShotOutcome(**{f.name: found[f.name] for f in fields(ShotOutcome) if f.name in found})
+        if outcome.name == name and _is_typed(outcome):
+            return outcome
     return None
+
+
+def _is_typed(outcome: ShotOutcome) -> bool:
+    """Whether every field holds what it should: a state may come from a store that others write to."""
+    for f in fields(outcome):
+        value = getattr(outcome, f.name)
+        if f.name == "warnings":
+            good = isinstance(value, list) and all(isinstance(w, str) for w in value)
+        elif f.name in ("seconds", "peak_memory_mb"):
+            good = isinstance(value, int | float) and math.isfinite(value)
+        else:
+            good = isinstance(value, str)
+        if not good:
+            return False
+    return True
 
 
 def write_outcome(folder: Path, outcome: ShotOutcome) -> None:
@@ -140,8 +160,8 @@ def is_running(folder: Path, name: str) -> bool:
 def names_of(folder: Path) -> list[str]:
     """Shots of a folder: those that batches put on its list, then others that something is known of."""
     listed: Any = []
-    with suppress(OSError, ValueError):
-        listed = json.loads((folder / LISTED).read_bytes())
+    with suppress(OSError, ValueError), (folder / LISTED).open("rb") as file:
+        listed = parse_json(file.read(LARGEST_LIST))
     names = [n for n in listed if isinstance(n, str) and is_name(n)] if isinstance(listed, list) else []
     others = sorted(p.name.removesuffix(STATE) for p in folder.glob(f"*{STATE}"))
     return list(dict.fromkeys([*names, *others]))

@@ -2,6 +2,8 @@
 
 Modules of the face:
 
+    array_archive  Arrays of .npy and .npz files that may come from anyone: no pickles, and nothing is taken on a
+                   header's word alone
     asset_folder   The asset folder: what is written where, and a reader that trusts nothing
     asset_lock     Who is at work on an asset: one process at a time writes its frames, one edit at a time changes
                    its scene.yaml
@@ -74,6 +76,7 @@ Modules of the face:
 """
 
 __all__ = [
+    "array_archive",
     "asset_folder",
     "asset_lock",
     "asset_paths",

@@ -33,7 +33,7 @@ MOST_MEMBERS = 10_000
 
 _MAX_ARRAYS = 2**30
 """bytes of all arrays of a part of an asset"""
-_IN_MEMORY = 64 * 2**20
+IN_MEMORY = 64 * 2**20
 """bytes of an array; larger ones of an npz are unpacked into a file without a name, and mapped"""
 _UNPACKED = 4
 """times the size of a file of packed arrays that they may take, if that is more than `_MAX_ARRAYS`"""
@@ -136,7 +136,7 @@ def array_in(archive: zipfile.ZipFile, member: zipfile.ZipInfo, kinds: str = "fi
     with archive.open(member) as stream:
         head = read_header(stream, member.file_size, kinds)
         order: Any = "F" if head.fortran else "C"
-        if head.nbytes > _IN_MEMORY:
+        if head.nbytes > IN_MEMORY:
             with tempfile.TemporaryFile() as file:  # written, not mapped: a full disk raises, where a map would kill
                 for piece in _pieces(stream, head.nbytes, member.filename):
                     file.write(piece)

@@ -19,6 +19,7 @@ from pathlib import Path
 from fluidlift.errors import InputRejected
 from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import disk_errors, remove_leftovers
+from fluidlift.io.limits import parse_json
 
 WRITING, EDITING = "work/.writing", "edits/.editing"
 """lock files, inside the asset"""
@@ -164,7 +165,7 @@ def _taken(file: int, kind: int) -> bool:
 
 def _holder(file: int) -> Holder:
     try:
-        note = json.loads(os.pread(file, _MAX_NOTE, 0))
+        note = parse_json(os.pread(file, _MAX_NOTE, 0))
         return Holder(int(note["pid"]), str(note["work"])[:100])
     except (OSError, ValueError, KeyError, TypeError, OverflowError):
         return Holder(0, "another run")

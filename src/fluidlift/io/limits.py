@@ -12,6 +12,9 @@ from fluidlift.errors import InputRejected, require
 
 MAX_TEXT_BYTES = 16 * 2**20
 """of a JSON file"""
+MAX_DEPTH = 100
+"""of lists and objects inside each other: files of ours need ten. Python reads five times as many, but what walks them
+afterwards (to write them, to compare them) calls itself more than once for each, and its stack ends"""
 MAX_PIXEL_BYTES = 16
 """of decoded samples for each pixel of `ReadLimits.max_pixels`: four channels in single precision, or more on smaller
 pictures"""
@@ -100,16 +103,27 @@ def parse_json(data: bytes | str) -> Any:
     """Plain data of a JSON text (UTF-8). Whole numbers that no reader can mean become infinite, as `1e999` does.
 
     Raises:
-        ValueError: no JSON, no UTF-8, half a character, or lists nested more deeply than Python goes.
+        ValueError: no JSON, no UTF-8, half a character, or more than `MAX_DEPTH` lists and objects inside each other.
     """
     try:
         text = data if isinstance(data, str) else data.decode("utf-8")
         value = json.loads(text, parse_int=_whole_number)
+        if text.count("[") + text.count("{") > MAX_DEPTH and not _is_shallow(value):
+            raise RecursionError
         if "\\u" in text:  # half of a pair is no character: it can be neither printed nor written
             json.dumps(value, ensure_ascii=False).encode("utf-8")
         return value
     except RecursionError:
         raise ValueError("lists and objects nested too deeply") from None
+
+
+def _is_shallow(value: Any) -> bool:
+    """Whether no more than `MAX_DEPTH` lists and dictionaries lie inside each other."""
+    level = [value]
+    for _ in range(MAX_DEPTH):
+        within = (v.values() if isinstance(v, dict) else v for v in level if isinstance(v, dict | list))
+        level = [item for items in within for item in items]
+    return not any(isinstance(v, dict | list) for v in level)
 
 
 def _whole_number(text: str) -> int | float:

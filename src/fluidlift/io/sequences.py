@@ -28,6 +28,11 @@ def list_sequence(path: Path | str) -> list[tuple[int, Path]]:
 
 
 def _in_folder(folder: Path) -> list[tuple[int, Path]]:
+    if (folder / "manifest.json").is_file() and (folder / "scene.yaml").is_file():
+        raise InputRejected(
+            f"'{folder.name}' is an asset, not a clip", "a video, or a folder of pictures",
+            f"look at it with 'fluidlift view {folder.name}', check it with 'fluidlift validate {folder.name}'",
+        )  # fmt: skip
     files = [p for p in folder.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES and not p.name.startswith(".")]
     kinds = sorted({p.suffix.lower() for p in files})
     if not files:

@@ -205,13 +205,14 @@ class ParticleSimulator(ABC):
             counts, shift, time = state["counts"], np.array(state["inlet_shift"], np.float64), float(state["time"])
             drained, refilled = float(state.get("drained", 0.0)), float(state.get("refilled", 0.0))
             emitted = np.array(state.get("emitted_until", np.zeros(0)), np.float64)
-            require(counts.shape == (2,) and shift.shape == (3,), "counters of another shape")
+            whole = counts.shape == (2,) and counts.dtype.kind in "iu" and shift.shape == (3,)
+            require(whole and bool(np.isfinite([time, drained, refilled, *shift]).all()), "counters of another kind")
             require(emitted.shape == (len(self._inlet.emissions),), "a simulation state with other emitters")
             for name in ("positions", "velocities", "affine", "deformation", "masses"):
                 require(bool(np.isfinite(getattr(particles, name)).all()), f"{name} that are not finite")
             fresh = np.random.default_rng(0)
             fresh.bit_generator.state = generator
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
             raise InputRejected(f"a simulation state that does not fit: {error}") from None
         self._particles, self._rng, self.time = particles, fresh, time
         self.drained, self.refilled = drained, refilled

@@ -148,7 +148,7 @@ class FrameWriter:
         rows: dict[int, dict[str, Any]] = {}
         if not self.journal.is_file():
             return rows
-        for line in self.journal.read_text(encoding="utf-8").splitlines():
+        for line in self.journal.read_bytes().splitlines():
             try:
                 row = parse_json(line)
                 t = int(row["frame"])

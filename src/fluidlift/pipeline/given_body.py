@@ -34,8 +34,22 @@ class SeenBodies:
 
 
 def note_of(folder: Path | None) -> dict[str, Any] | None:
-    """What a generator's folder says of itself; None for one of the user's."""
-    return read_json(folder / NOTE, NOTE) if folder is not None and (folder / NOTE).is_file() else None
+    """What a generator's folder says of itself; None for one of the user's.
+
+    Raises:
+        InputRejected: a note that cannot be read, or lacks what `NOTE` names.
+    """
+    if folder is None or not (folder / NOTE).is_file():
+        return None
+    note = read_json(folder / NOTE, NOTE)
+    frames = note.get("frames") if isinstance(note, dict) else None
+    whole = isinstance(frames, list) and len(frames) > 0 and all(type(t) is int and 0 <= t < 10**9 for t in frames)
+    if not whole or not all(isinstance(note.get(name), bool) for name in ("metric", "knows_up")):
+        raise InputRejected(
+            f"'{NOTE}' in '{folder.name}' is not what a generator wrote", "metric, knows_up and frames",
+            "make the bodies again (--force generate), or delete the file: its PLY files then count in order of name",
+        )  # fmt: skip
+    return note
 
 
 def given_bodies(folder: Path, size: tuple[int, int], frames: list[int]) -> SeenBodies:

@@ -42,7 +42,9 @@ def require_unchanged(masks: Path, stage: str) -> None:
     facts = facts if isinstance(facts, dict) else {}
     if "sha256" not in facts:
         return
-    if digest_of(numbered(masks, t, ".png") for t in range(facts.get("frames", 0))) != facts["sha256"]:
+    frames = facts.get("frames", 0)
+    there = type(frames) is int and 0 <= frames <= sum(1 for _ in masks.glob("*.png"))  # else some were taken away
+    if not there or digest_of(numbered(masks, t, ".png") for t in range(frames)) != facts["sha256"]:
         raise InputRejected(
             f"the masks in '{masks}' were changed since they were written", "another folder",
             f"choose another one with -o, or write over them with --force {stage}",

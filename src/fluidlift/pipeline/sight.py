@@ -171,7 +171,7 @@ def sighted(
     warnings = framing_warnings(mask, fluid.areas()) + up.warnings + composite.unused_marks(parts, front)
     warnings += [*seen.told, *_unused_flow(seen, front.vessel is not None)]
     if c.kind == "auto":
-        warnings += kinds.doubts(seen.evidence)
+        warnings += kinds.doubts(seen.evidence, seen.kind.name)
     front, falling = composite.standing(front, parts, canonical, mask)
     visible = mask & (front.depth > 0)
     if 0 < visible.sum() < FEWEST_PIXELS:

@@ -12,7 +12,7 @@ from fluidlift.pipeline.settings import MotionSettings
 from fluidlift.shape.airborne import MOUTH, nozzle_radius
 from fluidlift.shape.jet_column import Jet
 from fluidlift.shape.occluders import near_occluders
-from fluidlift.types import Grid, PixelFlow, SurfaceMotion, VideoClip
+from fluidlift.types import Grid, PixelFlow, SurfaceMotion, VideoClip, kind_of
 from fluidlift.types.stages import Geometry
 
 if TYPE_CHECKING:
@@ -130,13 +130,15 @@ def motion_warnings(reports: list[dict[str, Any]], kind: str, free_fall_share: f
         )
     circulating = [r["circulating"] for r in reports if r.get("circulating") is not None]
     if circulating and np.median(circulating) < WAVES:
+        # of a fountain it is its pool that is seen from above; what is in the air is thrown, and simulated
+        pool = kind_of(kind).rises_from_pool
+        where, calm = (f"pool of the {kind}", "that and what falls into it") if pool else (kind, "that")
         warnings.append(
             Notice(
                 "waves-not-simulated",
-                f"what is seen to move over the {kind} is taken for waves: only "
+                f"what is seen to move over the {where} is taken for waves: only "
                 f"{100 * np.median(circulating):.0f} % of its speed can be water that circulates within its outline; "
-                "the re-simulation "
-                "is calm but for that, and the film on its surface shows the waves",
+                f"it is simulated calm but for {calm}, and the film on its surface shows the waves",
             )
         )
     if free_fall_share > FAST_FALL:

@@ -234,7 +234,9 @@ def _surface_rows(geometry: Geometry) -> list[list[str]]:
     """How the camera stands and what the surface was taken from, and how sure both are."""
     up, slope, depth = geometry.up, geometry.slope, geometry.depth_source
     error = f" ± {up.error:.0f}" if up.error else ""
-    tilt = f"{up.pitch:.1f}{error} degrees, rolled {up.roll:.1f} ({up.source}, confidence {up.confidence:.2f})"
+    built = f", built as from {up.pitch:.1f}" if up.raised else ""  # what was seen is sure to so much, not the relief
+    sure = f"({up.source}, confidence {up.confidence:.2f})"
+    tilt = f"{up.pitch - up.raised:.1f}{error} degrees{built}, rolled {up.roll:.1f} {sure}"
     rows = [["camera looks down by", tilt]]
     if depth is not None:
         rows.append(["surface", f"by the {depth['source']}"])
@@ -299,8 +301,8 @@ def _section_motion(lift: Lift) -> Section:
             r["frame"],
             r.get("divergence_max", ""),
             r.get("divergence_mean", ""),
-            r.get("flux_in", ""),
-            r.get("flux_out", ""),
+            r.get("flux_in", 0.0) + 0.0,  # no minus nothing
+            r.get("flux_out", 0.0) + 0.0,
         ]
         for r in motion.reports[:12]
     ]

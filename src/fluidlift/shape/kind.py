@@ -65,15 +65,17 @@ STRAIGHT = 10.0
 """degrees: a larger lean of what falls is a thrown jet or wind, not a turned camera"""
 
 
-def doubts(evidence: KindEvidence) -> tuple[Notice, ...]:
-    """What a user should know of how sure the kind is; empty where it is."""
+def doubts(evidence: KindEvidence, built: str) -> tuple[Notice, ...]:
+    """What a user should know of how sure the kind is; empty where it is. `built`: the kind that was taken, which is
+    neither of the likeliest where several bodies make up one."""
     (best, share), (second, other) = sorted(evidence.scores.items(), key=lambda item: -item[1])[:2]
     if share >= LEAST_SURE:
         return ()
     return (
         Notice(
             "kind-unsure",
-            f"what kind of fluid this is, is unsure: {best} ({share:.2f}) or {second} ({other:.2f}); --kind decides",
+            f"what kind of fluid this is, is unsure: {best} ({share:.2f}) or {second} ({other:.2f}); "
+            f"it is built as {built}, and --kind decides",
         ),
     )
 

@@ -21,6 +21,7 @@ from typing import Any
 from fluidlift.config import JobConfig
 from fluidlift.errors import FluidliftError, InputRejected, MissingPackage
 from fluidlift.io.atomic import new_temporary
+from fluidlift.io.limits import parse_json
 from fluidlift.pipeline import Inputs
 from fluidlift.pipeline.models import NO_MODELS, ModelWish
 from fluidlift.served import PAGE_HEADERS, free_port, knows, same_origin
@@ -329,7 +330,7 @@ async def _do(request: Any) -> Any:
         if len(body) > LARGEST_JSON:
             return _plain({"error": "too much at once"}, 413)
     try:
-        data = json.loads(body or b"{}")
+        data = parse_json(body or b"{}")
     except ValueError:
         data = None
     act = _ACTS.get(request.path_params["what"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,8 @@ class HintsHistory:
                 self._done = [d for d in kept["done"] if isinstance(d, dict)][-MOST_STEPS:]
                 self._undone = [d for d in kept["undone"] if isinstance(d, dict)][-MOST_STEPS:]
             except (InputRejected, KeyError, TypeError):
-                steps.unlink()  # only a convenience is lost
+                with suppress(OSError):  # only a convenience is lost
+                    steps.unlink()
 
     @property
     def time(self) -> float | None:

@@ -333,3 +333,30 @@ def test_types_that_json_cannot_tell_apart_are_refused():
 
 def test_nothing_is_left_out_of_a_stage():
     assert list(field_types(stages.Read)) == [f.name for f in fields(stages.Read)]
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """As a version before had it."""
+
+    values: Float[np.ndarray, " n"]
+    loss: list[float]
+    count: int
+
+
+@dataclass(frozen=True)
+class Later:
+    """Without the loss, and with a field that has a default."""
+
+    values: Float[np.ndarray, " n"]
+    count: int
+    seen: float = 0.5
+
+
+def test_a_value_of_another_version_is_read_where_all_that_is_needed_is_there():
+    arrays, data = packed(Earlier(np.arange(3.0), [1.0], 2))
+    found = unpacked(Later, arrays, data)
+    assert found.values.tolist() == [0.0, 1.0, 2.0] and found.count == 2 and found.seen == 0.5
+    arrays, data = packed(found)
+    with pytest.raises(Mistyped):
+        unpacked(Earlier, arrays, data)

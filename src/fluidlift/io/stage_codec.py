@@ -11,7 +11,7 @@ import math
 import types
 import typing
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import cache
 from typing import Any, TypeVar
@@ -62,6 +62,12 @@ def field_types(kind: type) -> dict[str, Any]:
     return {f.name: hints[f.name] for f in fields(kind)}
 
 
+@cache
+def _needed(kind: type) -> frozenset[str]:
+    """Names of the fields of a dataclass that have no default."""
+    return frozenset(f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING)
+
+
 def _packed(hint: Any, value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
@@ -101,8 +107,9 @@ def _unpacked(hint: Any, data: Any, path: str, arrays: Arrays) -> Any:
         return _checked(hint, arrays[path], path)
     if isinstance(hint, type) and is_dataclass(hint):
         known = field_types(hint)
-        _require(isinstance(data, dict) and data.keys() == known.keys(), path, data, hint)
-        return hint(**{n: _unpacked(t, data[n], _at(path, n), arrays) for n, t in known.items()})
+        # a value of another version may have fields that are gone by now, and lack those that it did without
+        _require(isinstance(data, dict) and _needed(hint) <= data.keys(), path, data, hint)
+        return hint(**{n: _unpacked(t, data[n], _at(path, n), arrays) for n, t in known.items() if n in data})
     if origin in (tuple, list):
         _require(isinstance(data, list), path, data, hint)
         parts = _parts(origin, inner, len(data), path)

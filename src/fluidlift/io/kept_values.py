@@ -31,14 +31,17 @@ CORRECTED = {"segment": "correct"}
 """stages whose value is replaced by that of another where that was run: labels with a person's regions over them"""
 
 
-def kept_value(folder: Path, name: str, key: str, kind: type[T]) -> tuple[T, float] | None:
-    """A stage's value in the cache with the seconds that it took; None where it is gone, damaged or of another type."""
+def kept_value(folder: Path, name: str, key: str, kind: type[T], *, exact: bool = True) -> tuple[T, float] | None:
+    """A stage's value in the cache with the seconds that it took; None where it is gone, damaged or of another type.
+
+    Not `exact`: the type may have other fields than when it was kept (`stage_codec.unpacked`).
+    """
     found = load_stage(folder, name, key)
     if found is None:
         return None
     arrays, meta = found
     try:
-        return unpacked(kind, arrays, meta["value"]), float(meta["seconds"])
+        return unpacked(kind, arrays, meta["value"], exact=exact), float(meta["seconds"])
     except (Mistyped, KeyError, TypeError, ValueError, OverflowError):
         return None
 
@@ -61,7 +64,8 @@ def kept_stage(folder: Path, manifest: dict[str, Any], name: str, kind: type) ->
     """
     keys = stage_keys(manifest)
     stage = CORRECTED[name] if CORRECTED.get(name) in keys else name
-    found = None if stage not in keys else kept_value(folder, stage, keys[stage], kind)
+    # it may be of a version before, whose values had other fields
+    found = None if stage not in keys else kept_value(folder, stage, keys[stage], kind, exact=False)
     return None if found is None else KeptStage(stage, keys[stage], *found)
 
 

@@ -45,10 +45,20 @@ def packed(value: Any) -> tuple[dict[str, np.ndarray], Any]:
     return arrays, _packed(type(value), value, "", arrays)
 
 
-def unpacked(kind: type[T], arrays: Arrays, data: Any) -> T:
-    """The reverse of `packed`; raises `Mistyped` where arrays or data are not those of such a value."""
+def unpacked(kind: type[T], arrays: Arrays, data: Any, *, exact: bool = True) -> T:
+    """The reverse of `packed`.
+
+    Args:
+        kind: type of the value.
+        arrays, data: as `packed` gives them.
+        exact: with all fields and no other. Else fields that are gone by now are left out, and those that a version
+            before did without take their default.
+
+    Raises:
+        Mistyped: arrays or data that are not those of such a value.
+    """
     try:
-        return _unpacked(kind, data, "", arrays)
+        return _unpacked(kind, data, "", arrays, exact)
     except Mistyped:
         raise
     except (FluidliftError, ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
@@ -96,27 +106,29 @@ def _packed(hint: Any, value: Any, path: str, arrays: dict[str, np.ndarray]) -> 
     return _scalar(hint, value.item() if isinstance(value, np.generic) else value, path, as_text=True)
 
 
-def _unpacked(hint: Any, data: Any, path: str, arrays: Arrays) -> Any:
+def _unpacked(hint: Any, data: Any, path: str, arrays: Arrays, exact: bool) -> Any:
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
         return data
     if origin in (typing.Union, types.UnionType):
-        return None if data is None else _unpacked(_only(inner, path), data, path, arrays)
+        return None if data is None else _unpacked(_only(inner, path), data, path, arrays, exact)
     if _is_array(hint):
         _require(data == path and path in arrays, path, data, "an array")
         return _checked(hint, arrays[path], path)
     if isinstance(hint, type) and is_dataclass(hint):
         known = field_types(hint)
-        # a value of another version may have fields that are gone by now, and lack those that it did without
         _require(isinstance(data, dict) and _needed(hint) <= data.keys(), path, data, hint)
-        return hint(**{n: _unpacked(t, data[n], _at(path, n), arrays) for n, t in known.items() if n in data})
+        _require(not exact or data.keys() == known.keys(), path, data, hint)
+        return hint(**{n: _unpacked(t, data[n], _at(path, n), arrays, exact) for n, t in known.items() if n in data})
     if origin in (tuple, list):
         _require(isinstance(data, list), path, data, hint)
         parts = _parts(origin, inner, len(data), path)
-        return origin(_unpacked(t, v, _at(path, i), arrays) for i, (t, v) in enumerate(zip(parts, data, strict=True)))
+        return origin(
+            _unpacked(t, v, _at(path, i), arrays, exact) for i, (t, v) in enumerate(zip(parts, data, strict=True))
+        )
     if origin is dict:
         _require(isinstance(data, dict), path, data, hint)
-        return {k: _unpacked(inner[1], v, _at(path, i), arrays) for i, (k, v) in enumerate(data.items())}
+        return {k: _unpacked(inner[1], v, _at(path, i), arrays, exact) for i, (k, v) in enumerate(data.items())}
     if origin is typing.Literal:
         _require(data in inner, path, data, hint)
         return data

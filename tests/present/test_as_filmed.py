@@ -52,7 +52,8 @@ def test_evaluate_says_why_there_is_no_card_and_what_to_do(asset, capsys):
     done = read_manifest(asset)["simulation"]
     update_manifest(asset, simulation=done | {"as_filmed": {"none": "the scene is edited (obstacles): run it again"}})
     assert main(["evaluate", str(asset)]) == REJECTED
-    assert "the scene is edited (obstacles): run it again" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "the scene is edited (obstacles)." in said and "Do: run it again." in said
     for broken in (None, {"figures": {"level": {"value": 1.0}}}):
         update_manifest(asset, simulation=done | {"as_filmed": broken} if broken else {"as_filmed": {"figures": 3}})
         assert main(["evaluate", str(asset)]) == REJECTED

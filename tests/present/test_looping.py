@@ -20,6 +20,7 @@ from fluidlift.present.looping import (
     changed_over,
     faded,
     patch_size,
+    seam,
 )
 from fluidlift.scene.build import LOOP_FADE, loop_overlap
 from fluidlift.scene.edits import EditSession
@@ -30,12 +31,6 @@ from fluidlift.types import CellType, FluidParameters, Gaussians
 def pictures(folder, count, camera):
     frames = [read_frame(frame_file(folder, FIRST_FRAME + k)).gaussians for k in range(count)]
     return np.stack([render(g, camera).image for g in frames])
-
-
-def seam(pictures):
-    """Mean absolute difference of pictures from the last to the first, and from each to the next: mean and largest."""
-    steps = np.array([np.abs(b.astype(np.float64) - a).mean() for a, b in zip(pictures[:-1], pictures[1:])])
-    return float(np.abs(pictures[0].astype(np.float64) - pictures[-1]).mean()), float(steps.mean()), float(steps.max())
 
 
 def frame(ids, opacity=0.9, shift=0.0):

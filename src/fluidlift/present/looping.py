@@ -175,3 +175,13 @@ def _fade(history: FrameHistory, count: int, fade: int, folder: Path) -> None:
         history.count[k] = len(shown.ids)
         history.leak[k] = max(history.leak[k], history.leak[count + k])
         history.poses[k] = blended_poses(poses[k], poses[count + k], glide)
+
+
+def seam(pictures: Float[np.ndarray, "t h w c"]) -> tuple[float, float, float]:
+    """How much a loop's pictures change from the last to the first, and from each to the next: mean and largest.
+
+    Mean absolute difference over the pixels, in the unit of the pictures.
+    """
+    steps = np.array([np.abs(b.astype(np.float64) - a).mean() for a, b in zip(pictures[:-1], pictures[1:])])
+    across = float(np.abs(pictures[0].astype(np.float64) - pictures[-1]).mean())
+    return across, float(steps.mean()), float(steps.max())

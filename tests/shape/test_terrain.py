@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+from scipy import ndimage
 
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics.apic import LiquidSimulator
@@ -417,21 +418,22 @@ def test_standing_water_goes_on_where_the_picture_cuts_it_and_deepens_away_from_
     assert np.allclose(setting.surface_height, 0.0)
 
 
-def sea(shore=2.0, pole=False, **config):
+def sea(shore=2.0, pole=False, lean=0.0, **config):
     """Setting of a sea beyond a beach, built from higher than it is seen: its horizon is at a third of the picture.
 
-    Without what is known of the horizon for comparison; `pole`: something stands before it.
+    Without what is known of the horizon for comparison; `pole`: something stands before it; `lean`: px by which the
+    horizon falls from left to right.
     """
     camera = PinholeCamera.looking((0.0, -6.0, 3.0), (0.0, 0.0, 0.0), 50.0, (132, 96))
     rays = camera.rays(camera.pixel_grid())
     ground = camera.position - rays * (camera.position[2] / np.minimum(rays[..., 2], -1e-3))[..., None]
-    row = np.arange(96)[:, None] + np.zeros(132)
+    row = np.arange(96)[:, None] - lean * (np.arange(132) / 132.0 - 0.5)
     labels = np.where((ground[..., 1] > -shore) & (row >= 32), Label.FLUID, Label.BACKGROUND).astype(np.uint8)
     if pole:
         labels[28:36, 60:64] = Label.BACKGROUND
     wet = labels == Label.FLUID
     made = []
-    for horizon in (((0.0, 31.0), (132.0, 31.0)), None):
+    for horizon in (((0.0, 31.0 - 0.5 * lean), (132.0, 31.0 + 0.5 * lean)), None):
         seen = PlanEvidence(
             PlaneHeight((0.0, 0.0), 0.0), labels, ground[wet], camera, np.array([1.0, 0, 0]), closed=True, goes_on=True,
             ever=wet, horizon=horizon,
@@ -451,6 +453,21 @@ def test_a_sea_ends_at_its_horizon_and_not_at_a_bank_of_sky():
     assert (line > 31.0 - 2.0).all() and line.max() < 34.0, "no water in the sky, none missing below it"
     wet = (setting.cell_types == CellType.FLUID).any(axis=2)
     assert wet[:, -2:].mean() > 0.9, "neither does what stands before the horizon"
+
+
+def test_a_horizon_that_leans_leaves_no_water_beyond_it():
+    setting, _, camera = sea(lean=8.0)
+    grid, terrain = setting.terrain.grid, setting.terrain
+    level = grid.centers()[:, :, 0].copy()
+    level[..., 2] = 0.0
+    uv = camera.project(level)[0]
+    beyond = uv[..., 1] < 31.0 + 8.0 * (uv[..., 0] / 132.0 - 0.5)
+    assert 0.02 < beyond.mean() < 0.3
+    assert not (setting.cell_types == CellType.FLUID).any(axis=2)[beyond].any()
+    level[..., 2] = 0.5 * grid.spacing
+    inner = ndimage.binary_erosion(beyond, iterations=2, border_value=1)
+    assert inner.any() and (sample_nodes(terrain.signed_distance, grid, level[inner]) < 0).all(), "it stays dry"
+    assert (setting.bed_height[beyond] < 0).all(), "and no bank is shown"
 
 
 def test_a_sea_shelves_as_sand_does_and_its_beach_is_flat():

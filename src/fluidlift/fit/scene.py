@@ -21,6 +21,8 @@ from fluidlift.types import CellType, FaceVelocity, FluidKind, Grid, Terrain, ki
 
 LONGEST_WINDOW = 25
 """steps; the paper's longest"""
+SWEEPS = 5
+"""cells that velocity is extrapolated beyond the fluid, for a front that crosses some within a window"""
 
 
 @dataclass(frozen=True)
@@ -155,7 +157,7 @@ def _layout(
         system = build_system(gas_layout(types) if gas else types, system_or_terrain, grid, open_border=gas)
     smoke = (types == CellType.FLUID).astype(float) if gas else None
     outlet = mainstream if (types == CellType.OUTFLOW).any() else None
-    return prepare_domain(types, system, mainstream=outlet, smoke=smoke, sweeps=5)
+    return prepare_domain(types, system, mainstream=outlet, smoke=smoke, sweeps=SWEEPS)
 
 
 def plan_windows(

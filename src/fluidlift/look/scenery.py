@@ -29,6 +29,9 @@ SEEN = 0.6
 """share of the fluid's picture that the ground may not hide, from which a view will do"""
 SKETCH = 96
 """px, width of the pictures in which that is looked at"""
+MARCH = 96
+"""steps along a ray to the ground at most. One is at least a twentieth of a cell, and eight tenths of the distance to
+the ground, so that a ray that grazes it for so long is taken to miss it"""
 LIGHT = np.array([0.35, -0.45, 0.82])
 """direction towards a high light beside the viewer, world"""
 
@@ -197,7 +200,7 @@ def _met(terrain: Terrain, camera: PinholeCamera, rays: np.ndarray) -> np.ndarra
     z = np.maximum(near, 1e-6) + 1e-6
     hit = np.zeros(len(z), bool)
     active = np.where(far > z)[0]
-    for _ in range(96):
+    for _ in range(MARCH):
         if len(active) == 0:
             break
         p = eye + rays[active] * z[active, None]

@@ -29,6 +29,8 @@ RESOLVED = 1e-5
 """1/px^2, mean weight of what hangs together, at least: ten times what float32 holds beside edges of up to
 `anisotropy` a pixel. Below it only the ratios of the weights count (the solution is their mean, all but constant), and
 the operator that rounding leaves is singular: on a real clip, a piece of 106 px with 6e-9 made all values NaN"""
+MOST_STEPS = 200
+"""of conjugate gradients: with the hierarchy a few tens do; what takes more is told as not converged"""
 COARSEST = 8
 """px on the longer side of the coarsest picture of the hierarchy"""
 COARSE_SHARE = 0.5
@@ -206,7 +208,7 @@ def _conjugate_gradient(levels: list[_Level], start: np.ndarray, tolerance: floa
     r = weight * start - image
     first = left = _size(r, inverse)
     rho, step = 1.0, 0
-    while left > tolerance * first + 1e-30 and step < 200:
+    while left > tolerance * first + 1e-30 and step < MOST_STEPS:
         z = _v_cycle(levels, scratch, r)
         before, rho = rho, _dot(r, z)
         _turn(z, rho / max(before, 1e-30) if step else 0.0, p)

@@ -113,8 +113,7 @@ def channel_setting(seen: PlanEvidence, config: ChannelConfig) -> Setting:
             rim &= _upper(plan.wet, plan.level)
     ground = _bed_and_banks(plan, grid, (depth, thin), extent, kind, rim, beach=beach)
     shown = np.minimum(ground.shown, np.maximum(_sight_lines(plan, grid, seen.camera), plan.level + LOWEST * spacing))
-    ground = replace(ground, bed=np.where(plan.label == Label.FLUID, ground.bed, shown), shown=shown)
-    ground = _as_seen(ground, plan, grid, seen, extent)
+    ground = _as_seen(_Ground(shown, shown, ground.water), plan, grid, seen, extent)
     return _fill_channel(grid, plan, ground, extent.reach, seen, kind)
 
 

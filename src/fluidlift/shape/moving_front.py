@@ -141,13 +141,13 @@ def without_strays(labels: np.ndarray) -> int:
     if not volume:
         return 0
     linked = coo_array((np.ones(len(edges)), tuple(np.array(edges, int).reshape(-1, 2).T)), (len(volume), len(volume)))
-    whole = connected_components(linked, directed=False)[1]
+    whole, at = connected_components(linked, directed=False)[1], np.array(frame)
     sizes = np.bincount(whole, volume)
-    frames = np.array([len(set(np.array(frame)[whole == w].tolist())) for w in range(len(sizes))])
-    stray = ((sizes < STRAY * sizes.max()) & (frames < 0.5 * len(labels)))[whole]
+    lasts = np.array([len(np.unique(at[whole == w])) for w in range(len(sizes))])
+    stray = ((sizes < STRAY * sizes.max()) & (lasts < 0.5 * len(labels)))[whole]
     cleared = 0
-    for t in np.unique(np.array(frame)[stray]).tolist():
-        gone = np.append(stray[np.array(frame) == t], False)[_pieces(labels[t])[1] - 1]
+    for t in np.unique(at[stray]).tolist():
+        gone = np.append(stray[at == t], False)[_pieces(labels[t])[1] - 1]  # the last for 0, what is no fluid
         labels[t][gone] = Label.BACKGROUND
         cleared += int(gone.sum())
     return cleared

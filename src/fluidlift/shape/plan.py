@@ -221,10 +221,9 @@ def plan_of(seen: PlanEvidence, grid: Grid, extent: Extent | None = None) -> Pla
     size = np.array(seen.camera.size)
     known = (z > 0) & (uv >= 0).all(axis=-1) & (uv < size).all(axis=-1)
     beyond = (z > 0) & seen.beyond_horizon(uv)
+    # what stands at the horizon of a sea is no far bank: the water goes on to it
+    known &= ~seen.beyond_horizon(uv - np.array([0.0, AT_HORIZON]))
     label = np.where(known, seen.labels[row, col], Label.BACKGROUND).astype(np.uint8)
-    if seen.reaches_horizon:  # what stands at the line is no far bank: the water goes on to it
-        line = known & seen.beyond_horizon(uv - np.array([0.0, AT_HORIZON]))
-        known &= ~line
     speed = np.full(label.shape, np.nan)
     if seen.speed is not None:
         speed = np.where(known & (label == Label.FLUID), seen.speed[row, col], np.nan)
@@ -247,12 +246,12 @@ def plan_of(seen: PlanEvidence, grid: Grid, extent: Extent | None = None) -> Pla
 
 
 def dry_columns(seen: PlanEvidence, plan: Plan, grid: Grid) -> Bool[np.ndarray, "nx ny"]:
-    """Columns that are seen, and that no water covers in the whole clip."""
+    """Columns that are seen, and that no water covers in the whole clip; and what lies beyond a horizon."""
     if seen.ever is None:
-        return np.zeros(plan.label.shape, bool)
+        return plan.beyond
     points = np.concatenate([grid.centers()[:, :, 0, :2], plan.level[..., None]], axis=-1)
     row, col, _ = seen.camera.nearest_pixels(points)
-    return plan.known & ~seen.ever[row, col] & (plan.label != Label.FLUID)
+    return plan.beyond | (plan.known & ~seen.ever[row, col] & (plan.label != Label.FLUID))
 
 
 def wide_ends(

@@ -41,8 +41,8 @@ SHELF = 0.125
 """m^(1/3), depth of a beach's bed over (distance from its waterline)^(2/3): equilibrium profile of sand of 0.3 mm
 (Dean 1977; 1991, Journal of Coastal Research 7; medium sand, and the middle of what beaches have)"""
 FORESHORE = 0.05
-"""slope of its dry sand (a choice: experiments on beaches take 1 in 15 and 1 in 25, as those of Dionisio Antonio and others
-2023, Journal of Marine Science and Engineering 11, 2244)"""
+"""slope of its dry sand (a choice: experiments on beaches take 1 in 15 and 1 in 25, as those of Dionisio Antonio and
+others 2023, Journal of Marine Science and Engineering 11, 2244)"""
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,12 @@ let messageOf = "";
 
 export function say(text) {
   messageOf = text;
+  message();
+}
+
+// an answer may come after the state that it led to: where it has nothing to say, the trouble of that state stays
+function message() {
+  const text = messageOf || page.state?.error || page.state?.look?.error || "";
   $("message").textContent = text;
   $("message").hidden = !text;
 }
@@ -54,8 +60,7 @@ function render() {
   $("empty").hidden = !!state.clip;
   $("undo").disabled = !state.undo;
   $("redo").disabled = !state.redo;
-  const trouble = state.error || state.look?.error || "";
-  if (!messageOf) { $("message").textContent = trouble; $("message").hidden = !trouble; }
+  message();
   panels(state, { act, change, page, showTab });
   options();
   strip(state);

@@ -138,6 +138,8 @@ obstacles:
         ("extend_downstream: -2", ["extend_downstream", "-2"]),
         ("look: {hue: 1}", ["line 1", "unknown entry 'hue' of look"]),
         ("parameters: {gravity: [0, 0]}", ["line 1", "3 numbers", "m/s^2"]),
+        ("obstacles: [{shape: sphere, radius: 30cm, position: [0, 0, 1]}]", ["a number from", "m. Do: write 0.3."]),
+        ("obstacles: [{shape: sphere, radius: 1, position: [4in, 0, 20 cm]}]", ["3 numbers", "write [0.1016, 0, 0.2]"]),
         ("parameters: [1]", ["name: value"]),
     ],
 )

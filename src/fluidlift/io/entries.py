@@ -10,6 +10,7 @@ import yaml
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.yaml_reader import composed
+from fluidlift.types.quantity import DEGREES, METRES, OF_UNIT, quantity
 
 Path = tuple[Any, ...]
 """keys and indices from the top of the file"""
@@ -48,6 +49,18 @@ def nearest(name: Any, known: Iterable[str]) -> str:
     """What to do about a wrong name: the valid one most like it, if any is."""
     close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
     return f"write '{close[0]}'" if close else "remove it"
+
+
+def in_unit(value: Any, unit: str) -> str:
+    """What to write instead of a quantity with a unit of its own, or a list of such; empty where it is none."""
+    units = {"m": METRES, "degrees": DEGREES}.get(unit) or OF_UNIT.get(unit, {})
+    try:
+        if isinstance(value, list) and any(isinstance(v, str) for v in value):
+            numbers = (quantity(v, units) if isinstance(v, str) else float(v) for v in value[:3])
+            return f"write [{', '.join(f'{v:g}' for v in numbers)}]"
+        return f"write {quantity(value, units):g}" if isinstance(value, str) else ""
+    except (TypeError, ValueError, OverflowError):
+        return ""
 
 
 class Entries:
@@ -97,7 +110,7 @@ class Entries:
             return default
         needed = f"a number from {low:g} to {high:g} {unit}".strip()
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.wrong(name, f"{name} of {self.what} is {value!r}", needed)
+            raise self.wrong(name, f"{name} of {self.what} is {value!r}", needed, in_unit(value, unit))
         if not low <= value <= high:  # a nan fails the comparison
             raise self.wrong(name, f"{name} of {self.what} is {str(value)[:20]}", needed)
         return float(value)
@@ -115,9 +128,8 @@ class Entries:
             return isinstance(v, int | float) and not isinstance(v, bool) and least <= v <= limit
 
         if not isinstance(value, list) or len(value) != 3 or not all(map(good, value)):
-            unit = f" {unit}" if unit else ""
-            needed = f"3 numbers from {least:g} to {limit:g}{unit}, such as {example}"
-            raise self.wrong(name, f"{name} of {self.what} is {value!r}", needed)
+            needed = f"3 numbers from {least:g} to {limit:g} {unit}".strip() + f", such as {example}"
+            raise self.wrong(name, f"{name} of {self.what} is {value!r}", needed, in_unit(value, unit))
         return tuple(float(v) for v in value)
 
     def flag(self, name: str, default: bool) -> bool:

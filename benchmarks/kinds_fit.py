@@ -45,24 +45,26 @@ BY_HAND = {
     # It has no surface, and so no edges
     "plume": {"always": -1.35, "rising": 2.34, "grey": 1.67, "grey and rising": 1.08, "changing": 0.72,
               "falling": -1.8, "sideways": -0.9, "hanging, not lifted": -2.25, "filling": -1.8,
-              "slender and still": -0.9, "lifted and sharp": -2.7},
+              "slender and still": -0.9, "lifted and sharp": -2.7, "drawn across": -0.9},
     # a jet hangs from above, falls and is slender; what falls a few decimetres is too fast for optical flow
     "pour": {"falling": 1.44, "followed": -1.8, "slender": 2.16, "hanging": 1.44, "wide": -1.08, "bulky": -2.25,
              "rising": -0.72, "lifted": -1.8, "sideways": -0.72, "slender and still": 0.9, "lifted and sharp": 1.8,
-             "lifted and smooth": -1.8},
-    # a curtain falls, is not slender, and slow enough in the picture to be followed, as it is metres high
+             "lifted and smooth": -1.8, "drawn across": -1.35, "drawn down": 0.9},
+    # a curtain falls, is not slender, and slow enough in the picture to be followed, as it is metres high; what becomes
+    # faster on its way down is drawn out along it
     "fall": {"falling": 2.52, "followed": 0.9, "slender": -1.44, "rising": -1.08, "sideways": -1.26,
-             "foreground": -0.9, "thrown": -2.7, "vessel": -1.8},
+             "foreground": -0.9, "thrown": -2.7, "vessel": -1.8, "drawn across": -2.7, "drawn down": 0.9},
     # what rises as well as it falls, free of its background, is thrown up: no brink does that
-    "fountain": {"always": -1.8, "thrown": 6.3},
-    # a stream runs across the picture, or along the line of sight and then fills the foreground; not out of a vessel
+    "fountain": {"always": -1.8, "thrown": 6.3, "drawn across": -1.8},
+    # a stream runs across the picture, or along the line of sight and then fills the foreground; not out of a vessel.
+    # A surface that lies is foreshortened where it is not seen from above, and so is its pattern
     "stream": {"always": 0.54, "sideways": 1.62, "wide, not falling": 0.72, "wide foreground": 1.8,
                "falling, far": -1.62, "rising, not filling": -1.35, "staying": -1.35, "vessel": -2.7,
-               "seen from above": 1.35},
+               "seen from above": 1.35, "drawn across": 0.9, "drawn down": -0.9},
     # what stays passes nothing on: it goes to and fro, round and round, or has but one side to go to
     "basin": {"always": -3.06, "wide and still": 0.72, "wide foreground": 1.8, "staying": 5.4, "staying inside": 1.35,
               "slender": -2.16, "falling": -1.8, "hanging, not bulky": -1.8, "changing": -1.8,
-              "seen from above": 1.35, "contained": 0.9},
+              "seen from above": 1.35, "contained": 0.9, "drawn across": 0.9, "drawn down": -0.9},
     # a body that stands comes down from where it was and spreads over ground that was dry
     "dam": {"always": -1.8, "collapsing": 6.3},
 }  # fmt: skip

@@ -1,5 +1,6 @@
 """Where the fit starts: what is measured at the ends of the flow, and what is taken for known."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,18 @@ from fluidlift.errors import InputRejected
 from fluidlift.pipeline.stages import fit as stage
 from fluidlift.shape.filled_vessel import FilledVessel, pool_depths
 from fluidlift.shape.kind import level_camera
-from fluidlift.types import CellType, FaceVelocity, Grid, Label, PinholeCamera, UpEvidence, VideoClip, kind_of
+from fluidlift.types import (
+    CellType,
+    Estimate,
+    FaceVelocity,
+    FluidParameters,
+    Grid,
+    Label,
+    PinholeCamera,
+    UpEvidence,
+    VideoClip,
+    kind_of,
+)
 from fluidlift.types.fluid_masks import FluidMasks
 
 GRID = Grid((12, 6, 5), 0.05, (0.0, 0.0, 0.0))
@@ -64,8 +76,27 @@ def test_the_fit_starts_with_the_speed_at_the_inlet_and_at_the_outlet(guess):
 def test_the_fluctuation_is_that_of_the_inlet_over_the_frames(guess):
     found = guess([flow(0.9), flow(1.1)])
     assert found.inflow_velocity[0] == pytest.approx(1.0)
-    # 0.1 along x and nothing along the others, in the mean over the components
-    assert found.inflow_fluctuation == pytest.approx(0.1 / 3, rel=1e-4)
+    # 0.1 along x and nothing along the others
+    assert found.inflow_fluctuation == pytest.approx(0.1, rel=1e-4)
+
+
+def test_a_steady_profile_is_no_fluctuation():
+    """Of the fit's pattern, which has both, the simulator's inlet has the profile already."""
+    cells = channel()
+    cells[1, :, :-1] = CellType.INFLOW
+    ramp = np.linspace(1.0, 0.4, GRID.shape[0] + 1)  # two layers of the inlet, a step of it apart
+    uneven = stage.inflow_unevenness(body("stream", cells), [flow(ramp - 0.02), flow(ramp + 0.02)])
+    assert uneven == pytest.approx(0.5 * (ramp[0] - ramp[1]), rel=1e-5)
+    initial = FluidParameters(inflow_fluctuation=0.02)
+    start = stage.with_profile(initial, uneven)
+    assert start.inflow_fluctuation == pytest.approx(np.hypot(uneven, 0.02))
+    e = Estimate(1.5 * start.inflow_fluctuation, 0.1 * start.inflow_fluctuation, True, start.inflow_fluctuation)
+    found, estimates = stage.without_profile(
+        replace(start, inflow_fluctuation=e.value), {"inflow_fluctuation": e}, initial, uneven
+    )
+    assert found.inflow_fluctuation == pytest.approx(1.5 * 0.02)
+    own = estimates["inflow_fluctuation"]
+    assert (own.value, own.sigma, own.prior) == pytest.approx((0.03, 0.002, 0.02))
 
 
 def test_water_that_flows_backwards_leaves_no_outlet_that_sucks(guess):

@@ -93,7 +93,8 @@ def advance(
 ) -> str | None:
     """Simulate and write the frames that are missing; why it broke down, if it did.
 
-    While a frame gets its look, another thread simulates the next one, and a third one writes the frame before.
+    While what floats on a frame's surface is carried along, another thread simulates the next frame, and a third one
+    gives the frame before its look and writes it.
 
     Args:
         simulator: at the last frame of `history`.
@@ -134,9 +135,11 @@ def advance(
             if ahead and k + 1 < scene.simulated:
                 coming = beside.submit(simulator.advance, scene.interval)
             history.add(scene, simulator, p, substeps)
-            shown = _look(simulator, appearance, scene, p, k)
-            written.begin(write_frame, folder, FIRST_FRAME + k, shown.gaussians, ids=shown.ids,
-                          velocities=shown.velocities)  # fmt: skip
+            appearance.advance(p, k)
+            if ahead and appearance.any_thread:
+                written.begin(_dress_and_write, folder, simulator, appearance.as_now(), scene, p, k)
+            else:
+                written.begin(_write, folder, k, _dressed(simulator, appearance, scene, p, k))
             if due or not ahead:  # a checkpoint says that its frames are there; what a device holds may change
                 written.wait()
             if due:
@@ -176,8 +179,19 @@ class Written:
             last.result()
 
 
-def _look(simulator: ParticleSimulator, appearance: SurfaceAppearance, scene: Scene, p: Particles, k: int) -> Dressed:
-    """The splats of frame k, whose particles are p; the simulator may be on its way to the next one."""
-    appearance.advance(p, k)
+def _dressed(
+    simulator: ParticleSimulator, appearance: SurfaceAppearance, scene: Scene, p: Particles, k: int
+) -> Dressed:
+    """The splats of frame k, whose particles are p; the simulator may be on its way to later ones."""
     inside = simulator.bodies.inside if scene.obstacles else None
     return appearance.dressed(p, k, inside, simulator.deformed)
+
+
+def _write(folder: Path, k: int, shown: Dressed) -> None:
+    write_frame(folder, FIRST_FRAME + k, shown.gaussians, ids=shown.ids, velocities=shown.velocities)
+
+
+def _dress_and_write(
+    folder: Path, simulator: ParticleSimulator, appearance: SurfaceAppearance, scene: Scene, p: Particles, k: int
+) -> None:
+    _write(folder, k, _dressed(simulator, appearance, scene, p, k))

@@ -7,6 +7,7 @@ under a skin whose pattern moves with the flow without being stirred into streak
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -391,6 +392,21 @@ class SurfaceAppearance:
             return
         self._patches.advance(self._surface, interval, rng)
         self._skin.advance(self._surface, interval, rng)
+
+    @property
+    def any_thread(self) -> bool:
+        """Whether a frame can be `dressed`, by what `as_now` gives, while this goes on to the next one."""
+        return self._whitewater is None
+
+    def as_now(self) -> SurfaceAppearance:
+        """The same at the frame to which `advance` has come, for `dressed` alone; the original may go on meanwhile.
+
+        What a frame changes is put anew in its place, never within its arrays.
+        """
+        now = copy(self)
+        if self._patches is not None:
+            now._patches, now._skin = copy(self._patches), copy(self._skin)
+        return now
 
     def dressed(
         self, particles: Particles, number: int, inside: Inside | None = None, deform: Deform | None = None

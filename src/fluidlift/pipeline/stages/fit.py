@@ -76,9 +76,10 @@ def fit(
         usual = tuple(name for name in usual if name != "inflow_velocity")
     free = request.free_of(usual)
     moved = _told_by_velocities(kind, free, lambda: outline_rises(masks, geometry.rest_frame))
-    start = startable(initial, request.held)
+    uneven = inflow_unevenness(geometry, motion.velocities)
+    start = with_profile(startable(initial, request.held), uneven)
     found, judged = _attempt(geometry, (motion, elsewhere), read.clip.interval, config, start, moved, work)
-    parameters, estimates = found.parameters, dict(found.estimates)
+    parameters, estimates = without_profile(found.parameters, found.estimates, initial, uneven)
     if not judged.usable:
         # the buoyancy of smoke was guessed from its speed by the fit
         parameters = replace(initial, gravity=parameters.gravity) if kind.is_gas else initial
@@ -261,7 +262,9 @@ def first_guess(
     bulk = mean[inlet].mean(axis=0) if inlet.any() else mean[wet].mean(axis=0)
     if kind.is_standing_water and not kind.rises_from_pool:  # what is left of a mean over a whirl is no inflow
         bulk = np.zeros(3)
-    spread = np.std([t.at_centers()[inlet] for t in targets], axis=0).mean() if inlet.any() else 0.0
+    spread = 0.0
+    if inlet.any():
+        spread = float(np.sqrt(np.var([t.at_centers()[inlet] for t in targets], axis=0).sum(axis=-1).mean()))
     if kind.rises_from_pool:  # the targets are one flight: what differs from drop to drop is not in them
         spread = SCATTER * float(np.linalg.norm(bulk))
     outlet = np.zeros(cells.shape, bool)
@@ -280,12 +283,47 @@ def first_guess(
     return FluidParameters(
         kinematic_viscosity=kind.kinematic_viscosity,
         inflow_velocity=(float(bulk[0]), float(bulk[1]), float(bulk[2])),
-        inflow_fluctuation=float(spread),
+        inflow_fluctuation=spread,
         outflow_velocity=max(out, 0.0),
         restitution=0.05,
         wall_damping=kind.wall_damping,
         time_step=float(np.clip(min(interval, 2.0 * courant), interval / 20, interval)),
     )
+
+
+def inflow_unevenness(geometry: Geometry, targets: list[FaceVelocity]) -> float:
+    """Root mean square (m/s) over the inlet of what the mean over time of the velocity there differs from its bulk by:
+    the profile of the inflow. 0 without an inlet."""
+    inlet = geometry.setting.cell_types == CellType.INFLOW
+    if not inlet.any():
+        return 0.0
+    mean = np.mean([t.at_centers()[inlet] for t in targets], axis=0)
+    return float(np.sqrt(np.square(mean - mean.mean(axis=0)).sum(axis=-1).mean()))
+
+
+def with_profile(initial: FluidParameters, uneven: float) -> FluidParameters:
+    """For the fit: its rollout has a bulk velocity at the inlet and one pattern about it, over the inlet and over time
+    (`fit.inlet.inflow_patterns`), so that its fluctuation is the root mean square of both.
+
+    Args:
+        initial: whose fluctuation is that in time alone, as the simulator has it: its inlet has a profile beside it.
+        uneven: m/s, of the profile (`inflow_unevenness`).
+    """
+    return replace(initial, inflow_fluctuation=float(np.hypot(uneven, initial.inflow_fluctuation)))
+
+
+def without_profile(
+    found: FluidParameters, estimates: dict[str, Estimate], initial: FluidParameters, uneven: float
+) -> tuple[FluidParameters, dict[str, Estimate]]:
+    """The way back from `with_profile`: as much larger or smaller as the fit found the whole pattern, the part of it
+    that changes in time is."""
+    name, whole = "inflow_fluctuation", float(np.hypot(uneven, initial.inflow_fluctuation))
+    if uneven == 0.0 or name not in estimates:
+        return found, dict(estimates)
+    share, e = initial.inflow_fluctuation / whole, estimates[name]
+    sigma = e.sigma * share if share > 0 else np.inf
+    own = replace(e, value=e.value * share, sigma=sigma, prior=e.prior * share)
+    return replace(found, inflow_fluctuation=found.inflow_fluctuation * share), dict(estimates) | {name: own}
 
 
 def sticking(kind: str | FluidKind, reports: list[dict[str, Any]]) -> float:

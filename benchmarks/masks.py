@@ -60,8 +60,12 @@ READING = ReadSettings(
 )
 UNJUDGED = 128
 """value of a drawn mask where a person could not tell"""
-NO_WATER = patch("fluidlift.shape.segment.with_open_water", lambda evidence, region, barred: region)
-"""masks without what `open_water` adds, which it is fitted on"""
+NO_WATER = patch.multiple(
+    "fluidlift.shape.segment",
+    with_open_water=lambda evidence, region, barred: region,
+    with_quiet_reaches=lambda evidence, region, barred: region,
+)
+"""masks without what `open_water`, which is fitted on them, and `quiet_reaches` after it add"""
 
 
 @dataclass(frozen=True)
@@ -226,9 +230,9 @@ def sampled_pixels(ready: Prepared, found: PixelLabels, most: int = 1500) -> dic
     pairs = SharedPairs(ready.clip, ready.flow)
     evidence = gather_evidence(ready.clip, pairs)
     size = evidence.noise.shape[::-1]
-    truth = cv2.resize(ready.truth[t], size, interpolation=cv2.INTER_AREA)
+    truth = cv2.resize(ready.truth[t], size, interpolation=cv2.INTER_NEAREST)
     inside = cv2.resize((found.labels[t] == Label.FLUID).astype(np.float32), size) > 0.5
-    places = np.flatnonzero((truth > 250) | (truth < 5))
+    places = np.flatnonzero(truth != UNJUDGED)  # at outlines, too: there masks are wrong, and confidence is judged
     picked = np.random.default_rng(0).permutation(places)[:most]
     columns = {
         "score": fluid_score(replace(evidence, carried=np.zeros_like(evidence.carried))), "carried": evidence.carried,

@@ -34,6 +34,7 @@ from fluidlift.shape.moving_solids import SharedPairs, moving_solids
 from fluidlift.shape.open_sea import reaching_over, sea_horizon, with_sea
 from fluidlift.shape.open_water import with_open_water
 from fluidlift.shape.presence import Presence, always, grows, remaining, stay, watch
+from fluidlift.shape.quiet_reaches import with_quiet_reaches
 from fluidlift.shape.region import clean_region, cut_along_edges, solids_in, still_pixels
 from fluidlift.shape.still_regions import without_ground
 from fluidlift.shape.swaying_jets import SwayingJets, swaying_jets, uncovered_over_time
@@ -51,10 +52,11 @@ DOUBTFUL = 1.5
 """log odds: what lies nearer to zero could be either"""
 MUCH_DOUBT = 0.4
 """doubtful places as part of the fluid from which a user is told: with half of them wrong, a fifth of the mask is"""
-BIAS, IN_OUTLINE, OF_SCORE, LOUDEST = 0.51, 1.21, 0.31, 8.0
+BIAS, IN_OUTLINE, OF_SCORE, LOUDEST = 0.51, 1.75, 0.31, 8.0
 """log odds of fluid of a pixel whose score is 0 and outline unknown, for one inside an outline (against it, outside),
-per unit of the score, and the score beyond which it says no more: logistic regression on pixels of 28 real clips
-(`benchmarks/masks_fit.py`). Of what has a chance of 0.8 by it, 8 in 10 are right, with each clip left out in turn"""
+per unit of the score, and the score beyond which it says no more: logistic regression on pixels of 34 real clips
+(`benchmarks/masks_fit.py` gives 1.87 and 0.30; 1.7 to 2.0 for an outline with each clip left out; held lower, so that
+nothing is sure where the loudest score speaks against it). Of what has a chance of 0.8 by it, 8 in 10 are right"""
 
 
 class LabelWriter:
@@ -183,14 +185,17 @@ class Clues:
         region = self._without_plants
         if self.horizon is not None:
             # nothing passes on a sea: what goes nowhere, or looks the same between two waves, is no rock for that
-            found = with_sea(evidence, region, self.solids | ~self.inside, self.horizon)
+            barred = self.solids | ~self.inside
+            found = with_sea(evidence, region, barred, self.horizon)
+            found = with_quiet_reaches(evidence, found, barred | (self.horizon.below(found.shape) <= 0.0))
             return Bed(found, np.zeros_like(found))
         if self.jets is not None:  # what they pour lies still, and is no ground
             return Bed(region, np.zeros_like(region))
         washed = washed_ground(evidence, region)
         region, rocks = without_ground(evidence, region)
         taken = self._first & ~region  # plants and washed ground wander, too, and were told from water already
-        region = with_open_water(evidence, region, rocks | self.solids | taken | ~self.inside)
+        barred = rocks | self.solids | taken | ~self.inside
+        region = with_quiet_reaches(evidence, with_open_water(evidence, region, barred), barred)
         return Bed(region, rocks, washed)
 
 

@@ -40,6 +40,7 @@ from fluidlift.shape.still_regions import without_ground
 from fluidlift.shape.swaying_jets import SwayingJets, swaying_jets, uncovered_over_time
 from fluidlift.shape.thin_outlines import slimmed
 from fluidlift.shape.vegetation import without_plants
+from fluidlift.shape.vessel_contents import Vessel, filled_vessels, with_contents
 from fluidlift.shape.view import OpenHorizon
 from fluidlift.shape.waterline import dry_over_time
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
@@ -176,6 +177,11 @@ class Clues:
         return swaying_jets(self.evidence, self._without_plants)
 
     @cached_property
+    def vessels(self) -> tuple[Vessel, ...]:
+        """Those that hold a liquid."""
+        return () if self.horizon is not None else filled_vessels(self.evidence, self.solids)
+
+    @cached_property
     def bed(self) -> Bed:
         """Where it is, if it stays in its bed."""
         evidence = self.evidence
@@ -286,6 +292,10 @@ def segment(
         found = advancing_labels(evidence, score, presence, np.where(barred, -12.0, told))
     else:
         found = staying_labels(known, clicks)
+    if known.vessels:
+        held = np.abs(heed(clicks, evidence, score, score > 0.0)[1]) > VOICE if clicks else np.zeros_like(solids)
+        alone = known.grown is not None
+        found = with_contents(found, known.vessels, evidence, solids | ~small_inside, held, alone=alone)
     tell(0.5, "labels")
     writer = LabelWriter((frames, height, width), out)
     share = write_labels(found, writer, small_inside, tell)

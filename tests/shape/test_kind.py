@@ -9,6 +9,7 @@ from fluidlift.shape.kind import (
     KINDS,
     SHAKE,
     doubts,
+    drawn_down,
     estimate_kind,
     estimate_up,
     level_camera,
@@ -90,10 +91,38 @@ def test_what_is_wide_is_no_stream_where_all_of_it_goes_up_and_out_at_the_top(to
     assert (scores["plume"] > scores["stream"]) == (top == 0), scores
 
 
+def rippled(clip, down, across):
+    """The clip with a pattern that changes all over, of ripples some px long down and across the picture."""
+    frames, masks, *flow = clip
+    noise = gaussian_filter(np.random.default_rng(0).normal(size=(T, H, W)), (0.0, down, across), mode="wrap")
+    shown = np.clip(frames + (20.0 / noise.std() * noise)[..., None], 0, 255).astype(np.uint8)
+    return np.where(masks[..., None], shown, frames), masks, *flow
+
+
+@pytest.mark.parametrize(("down", "across", "low", "high"), [(1, 3, -3, -1), (3, 1, 1, 3), (2, 2, -0.2, 0.2)])
+def test_a_pattern_is_drawn_out_the_way_it_is_longer(down, across, low, high):
+    frames, masks, *_ = rippled(curtain(), down, across)
+    assert low < drawn_down(frames, masks) < high
+    # what stands still counts for nothing: a bed, a mirrored bank
+    bed = gaussian_filter(np.random.default_rng(1).normal(size=(H, W)), (across, down))
+    with_bed = np.clip(frames.astype(float) + (10.0 / bed.std() * bed)[..., None], 0, 255).astype(np.uint8)
+    assert drawn_down(with_bed, masks) == pytest.approx(drawn_down(frames, masks), abs=0.2)
+    still = np.broadcast_to(with_bed[0], frames.shape)
+    assert drawn_down(still, masks) == 0.0
+
+
+def test_ripples_across_the_picture_lie_and_do_not_fall():
+    lying, plain, falling = (estimate_kind(*c) for c in (rippled(curtain(), 1, 3), curtain(), rippled(curtain(), 3, 1)))
+    assert lying.scores["fall"] < plain.scores["fall"] < falling.scores["fall"]
+    assert lying.scores["stream"] > 3.0 * plain.scores["stream"]
+
+
 def towards_the_viewer(near=4.0, far=0.2):
-    """A curtain's outline and motion, with a pattern that moves by `far` px per frame at its top and `near` below."""
+    """A curtain's outline and motion, with a pattern that moves by `far` px per frame at its top and `near` below;
+    where it recedes, seen at a slant, it is foreshortened."""
     frames, masks, *flow = curtain()
-    pattern = gaussian_filter(np.random.default_rng(0).normal(size=(H, W)), 2.0, mode="wrap")
+    length = 2.0 if far >= near else 1.0
+    pattern = gaussian_filter(np.random.default_rng(0).normal(size=(H, W)), (length, 2.0), mode="wrap")
     pattern *= 30.0 / pattern.std()
     step = np.interp(np.arange(H), [12, 75], [far, near])
     for t in range(T):
@@ -122,7 +151,7 @@ def poured_into_a_tray():
 
 
 def test_what_spreads_in_its_pool_and_slows_down_does_not_fall(monkeypatch):
-    found = estimate_kind(*poured_into_a_tray())
+    found = estimate_kind(*rippled(poured_into_a_tray(), 1, 2))
     assert found.features["spreading"] > 0.9
     assert found.kind == "stream" and found.scores["stream"] > 0.6, found.scores
     assert estimate_kind(*curtain()).features["spreading"] == 0.0

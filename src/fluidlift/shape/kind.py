@@ -28,8 +28,8 @@ KINDS: tuple[str, ...] = tuple(name for name, kind in FLUID_KINDS.items() if kin
 """names of the kinds whose evidence is weighed"""
 
 LEAST_SURE = 0.7
-"""probability of the kind below which a user is warned and told the next one: so 9 of 34 real clips (each judged by
-weights fitted to the others), one of the two wrong ones among them; 26 of 68 parts of their pictures, 14 of the 23
+"""probability of the kind below which a user is warned and told the next one: so 6 of 34 real clips (each judged by
+weights fitted to the others), one of the two wrong ones among them; 22 of 68 parts of their pictures, 12 of the 18
 wrong ones"""
 FOLLOWED = 0.3
 """share of the fluid that reliable flow sees falling, from which the flow counts as able to follow it. A fall of h

@@ -29,7 +29,7 @@ def fluid_of(clip, flow):
 
 @pytest.fixture(scope="module")
 def poured():
-    return filmed(20, "pour")
+    return filmed(20, "fill")
 
 
 def test_a_cup_that_fills_is_fluid_up_to_its_level_and_no_higher(poured):

@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from fluidlift.synthetic.hand_pour import LENS, NOISE, SUPERSAMPLING
 
-Happening = Literal["pour", "boil", "stir", "empty", "beside"]
+Happening = Literal["fill", "boil", "stir", "empty", "beside"]
 """a level that rises under a jet; bubbles in some of the surface; a pattern that turns; nothing in it; the same, and a
 jet that falls on the table beside it"""
 FOCAL = 2.5
@@ -147,7 +147,7 @@ def _frame(
         picture[there] = (color + (25.0 * _looked_up(grain, 3.0 * u, 3.0 * v))[..., None])[there]
         floats = floats | there
     wet, falls = wet & ~floats, np.zeros(x.shape, bool)
-    if happening in ("pour", "beside"):
+    if happening in ("fill", "beside"):
         falls, spout = _falling(look, below, happening, seconds, size)
         rows = np.arange(len(x))[:, None] + np.zeros(x.shape)
         ran = np.mod(4000.0 - FALLING * SUPERSAMPLING * seconds + rows, len(patterns.running) - 1)
@@ -169,7 +169,7 @@ def _liquid(look: _Look, patterns: _Patterns, happening: Happening, t: int, x: n
     else:
         radius = np.hypot(x, y)
         turned = np.arctan2(y, x) + 2.5 * t / FRAME_RATE * np.exp(-3.0 * radius)
-        amount = look.grain[1] * (np.exp(-2.0 * radius) if happening == "pour" else 1.0)
+        amount = look.grain[1] * (np.exp(-2.0 * radius) if happening == "fill" else 1.0)
         value = value + amount * _looked_up(patterns.stirred, radius * np.cos(turned), radius * np.sin(turned))
     return look.colors[3] + value[..., None]
 
@@ -183,7 +183,7 @@ def _drawn(rng: np.random.Generator, happening: Happening, size: tuple[int, int]
     depth = rng.uniform(0.6, 1.6)
     taper = np.tan(np.radians(rng.uniform(0.0, 30.0)))
     below = rng.uniform(0.15, 0.45) * depth
-    drawn = (below + rng.uniform(0.25, 0.4) * depth, below) if happening == "pour" else (below, below)
+    drawn = (below + rng.uniform(0.25, 0.4) * depth, below) if happening == "fill" else (below, below)
     drawn = (0.995 * depth, 0.995 * depth) if happening in ("empty", "beside") else drawn  # the floor, above the table
     return _Look(
         pitch=np.radians(rng.uniform(28.0, 60.0)),
@@ -271,8 +271,8 @@ def _falling(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Samples of a jet that falls onto the liquid or beside the vessel, and of the spout that it comes from."""
     aside = 1.6 if look.middle[0] < 0.5 * size[0] else -1.6
-    lands = (0.15, -0.05) if happening == "pour" else (aside, 0.3)
-    scale, depth = look.radius, below if happening == "pour" else look.depth
+    lands = (0.15, -0.05) if happening == "fill" else (aside, 0.3)
+    scale, depth = look.radius, below if happening == "fill" else look.depth
     u = look.middle[0] + scale * lands[0] + 1.5 * np.sin(2.0 * np.pi * seconds / 0.9)
     v = look.middle[1] + scale * (lands[1] * np.sin(look.pitch) + depth * np.cos(look.pitch))
     top = look.middle[1] - scale * np.sin(look.pitch) * 0.75

@@ -97,6 +97,9 @@ def test_a_steady_profile_is_no_fluctuation():
     assert found.inflow_fluctuation == pytest.approx(1.5 * 0.02)
     own = estimates["inflow_fluctuation"]
     assert (own.value, own.sigma, own.prior) == pytest.approx((0.03, 0.002, 0.02))
+    # one that was not fitted comes back as it went in
+    assert stage.without_profile(start, {}, initial, uneven)[0].inflow_fluctuation == pytest.approx(0.02)
+    assert stage.without_profile(initial, {}, initial, 0.0)[0] == initial
 
 
 def test_water_that_flows_backwards_leaves_no_outlet_that_sucks(guess):

@@ -318,12 +318,14 @@ def without_profile(
     """The way back from `with_profile`: as much larger or smaller as the fit found the whole pattern, the part of it
     that changes in time is."""
     name, whole = "inflow_fluctuation", float(np.hypot(uneven, initial.inflow_fluctuation))
-    if uneven == 0.0 or name not in estimates:
+    if uneven == 0.0:
         return found, dict(estimates)
-    share, e = initial.inflow_fluctuation / whole, estimates[name]
-    sigma = e.sigma * share if share > 0 else np.inf
-    own = replace(e, value=e.value * share, sigma=sigma, prior=e.prior * share)
-    return replace(found, inflow_fluctuation=found.inflow_fluctuation * share), dict(estimates) | {name: own}
+    share, own = initial.inflow_fluctuation / whole, dict(estimates)
+    if name in own:
+        e = own[name]
+        sigma = e.sigma * share if share > 0 else np.inf
+        own[name] = replace(e, value=e.value * share, sigma=sigma, prior=e.prior * share)
+    return replace(found, inflow_fluctuation=found.inflow_fluctuation * share), own
 
 
 def sticking(kind: str | FluidKind, reports: list[dict[str, Any]]) -> float:

@@ -68,7 +68,6 @@ def test_what_a_person_said_is_kept(poured):
     shape = known.evidence.noise.shape
     held = np.zeros(shape, bool)
     held[: shape[0] // 2] = True
-    dry = np.zeros(shape, np.uint8)
     dry = iter([(np.zeros(shape, np.uint8), np.zeros(shape, np.float32))])
     barred = np.zeros(shape, bool)
     labels, _ = next(with_contents(dry, known.vessels, known.evidence, barred, held, alone=False))

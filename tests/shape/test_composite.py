@@ -1,6 +1,7 @@
 import numpy as np
 
-from fluidlift.shape.composite import fills_a_vessel, in_vessel, split
+from fluidlift.shape.composite import split
+from fluidlift.shape.filled_vessel import fills_a_vessel, in_vessel
 from fluidlift.shape.view import drawn_rim
 from fluidlift.types import PinholeCamera, UpEvidence
 from fluidlift.types.kind import POUR, STREAM

@@ -29,6 +29,7 @@ from fluidlift.pipeline.work import Work
 from fluidlift.shape import (
     composite,
     dam,
+    filled_vessel,
     generate,
     puddle,
     registration,
@@ -69,7 +70,7 @@ from fluidlift.types import (
     kind_of,
 )
 from fluidlift.types.fluid_masks import FluidMasks
-from fluidlift.types.kind import LOOKING_DOWN, POUR, STREAM
+from fluidlift.types.kind import STREAM
 from fluidlift.types.stages import Flow, Read, Segmentation
 
 USUALLY = 0.25
@@ -391,7 +392,7 @@ def _kind_and_up(
         ways=looked.ways,
         rims=said.rims or looked.rims,
     )
-    kind = _likeliest(evidence, said.rims or looked.rims, shown, pitch) if c.kind == "auto" else kind_of(c.kind)
+    kind = kind_of(evidence.kind if c.kind == "auto" else c.kind)
     if kind.starts_at_rest and (shaped or bodies is not None):
         if c.kind != "auto":
             raise InputRejected(
@@ -408,7 +409,7 @@ def _kind_and_up(
             tilt = surveyed if pose_given else None
             poured = puddle.jet_over_spreading(tilt, mask) if kinds.spreads(evidence) else None
             poured = poured or puddle.jets_into_puddle(known, tilt, mask, motion, trust)
-            if poured is not None and not composite.in_vessel(said.rims or looked.rims, poured.lying):
+            if poured is not None and not filled_vessel.in_vessel(said.rims or looked.rims, poured.lying):
                 kind, parts = STREAM, composite.BodyParts(poured.jets, poured.lying, puddle=True)
     else:
         parts = composite.BodyParts((), mask)
@@ -438,12 +439,6 @@ def _kind_and_up(
     if c.pitch is None and kind.nearly_level and not shaped:
         up = as_relief(up, parts.lying & ~parts.falling, lambda tilted: kinds.level_camera(known, tilted))
     return evidence, kind, parts, up, None, steepness(picture)
-
-
-def _likeliest(evidence: KindEvidence, rims: tuple[Ellipse, ...], shown: np.ndarray, pitch: float | None) -> FluidKind:
-    """The kind that is built: a vessel that a jet is seen to fill is told by that, before all that is weighed."""
-    filled = composite.fills_a_vessel(rims, shown, pitch=LOOKING_DOWN[0] if pitch is None else pitch)
-    return POUR if filled else kind_of(evidence.kind)
 
 
 @dataclass(frozen=True)

@@ -13,25 +13,19 @@ from scipy import ndimage
 from fluidlift.messages import NONE, Notice
 from fluidlift.shape import airborne, chute, jets, registration
 from fluidlift.shape.drawn import region_pixels
+from fluidlift.shape.filled_vessel import in_vessel
 from fluidlift.shape.fountain_columns import find_columns
 from fluidlift.shape.jet_column import Jet, with_columns
 from fluidlift.shape.kind import level_camera
-from fluidlift.shape.region import largest_piece
 from fluidlift.shape.slope import LEVEL
 from fluidlift.shape.surface import FrontSurface
-from fluidlift.shape.view.roundness import IN_VESSEL, Ellipse
+from fluidlift.shape.view import Ellipse
 from fluidlift.types import GRAVITY, FluidKind, MetricScale, PinholeCamera, Setting, Similarity3, UpEvidence
 from fluidlift.types.hints import DrawnView
 from fluidlift.types.kind import LOOKING_DOWN, POUR, STREAM
 
 LEVEL_SAID = 0.999
 """share of streams that are level among those of which a person says so"""
-BELOW_ITS_RIM = 0.8
-"""of a rim's disc that a pool fills at most, where the wall shows above it: the outline of what fills more may be the
-pool's own"""
-FILLS = 0.1
-"""of what is seen of a liquid in a vessel on average, by which it is more in the last third of a clip than in the first
-where the vessel fills (a choice: outlines err by a few hundredths)"""
 LARGEST = 1000.0
 """m across the fluid, to which a size from a chute is believed: footage that is slowed down ten times shows 10 m so"""
 
@@ -102,42 +96,6 @@ def split(
         kind, found = (STREAM, [neck]) if neck is not None else (kind, [])
     lying = jets.lying_pixels(mask, jets.airborne_pixels(found, mask.shape))
     return kind, BodyParts(tuple(found), lying, puddle=neck is not None)
-
-
-def in_vessel(rims: Sequence[Ellipse], pool: Bool[np.ndarray, "h w"]) -> bool:
-    """Whether a pool lies within a rim and below it."""
-    # of an ellipse the covariance is a quarter of the square of half its axes
-    areas = [4.0 * np.pi * float(np.sqrt(np.linalg.det(rim.covariance))) for rim in rims]
-    return any(
-        rim.share_inside(pool) > IN_VESSEL and pool.sum() < BELOW_ITS_RIM * area
-        for rim, area in zip(rims, areas, strict=True)
-    )
-
-
-def fills_a_vessel(rims: Sequence[Ellipse], shown: Bool[np.ndarray, "t h w"], *, pitch: float) -> bool:
-    """Whether a thin jet falls into a vessel and what is seen of the liquid in that becomes more.
-
-    Args:
-        rims: of vessels that are seen.
-        shown: fluid pixels of some frames, spread over the clip.
-        pitch: degrees that the camera looks down.
-    """
-    for rim in rims:
-        areas = np.array([rim.share_inside(mask) * mask.sum() for mask in shown])
-        third = max(len(areas) // 3, 1)
-        if areas[-third:].mean() - areas[:third].mean() < FILLS * max(areas.mean(), 1.0):
-            continue
-        necks = [_neck_within(rim, mask, pitch) for mask in shown]
-        if np.mean(necks) > 0.5:
-            return True
-    return False
-
-
-def _neck_within(rim: Ellipse, mask: np.ndarray, pitch: float) -> bool:
-    """Whether the silhouette shows a jet above a pool that lies in a vessel."""
-    piece = largest_piece(mask)
-    neck = jets.find_neck(piece, pitch=pitch) if piece.any() else None
-    return neck is not None and in_vessel([rim], jets.lying_pixels(piece, jets.airborne_pixels([neck], mask.shape)))
 
 
 def _rising(mask, motion, trust, tilt: UpEvidence) -> tuple[tuple[jets.JetOutline, ...], np.ndarray]:

@@ -7,6 +7,7 @@ So floor and level follow from the lowest and highest rows of the silhouette, an
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +15,9 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from fluidlift.shape.jets import airborne_pixels, find_neck, lying_pixels
+from fluidlift.shape.region import largest_piece
+from fluidlift.shape.view.roundness import IN_VESSEL, Ellipse
 from fluidlift.types import PinholeCamera, Similarity3, triple
 
 NARROW = 0.55
@@ -45,6 +49,12 @@ FINE = 1.0 / 64.0
 """of a wall's thickness between the places of its outline that distances are measured to: a hundredth of it is lost"""
 ACROSS = 64
 """places along a ray that are looked at in the pool"""
+BELOW_ITS_RIM = 0.8
+"""of a rim's disc that a pool fills at most, where the wall shows above it: the outline of what fills more may be the
+pool's own"""
+FILLS = 0.1
+"""of what is seen of a liquid in a vessel on average, by which it is more in the last third of a clip than in the first
+where the vessel fills (a choice: outlines err by a few hundredths)"""
 
 
 @dataclass(frozen=True)
@@ -363,3 +373,39 @@ def _longest_run(line: np.ndarray) -> tuple[int, int]:
     begins, ends = edges[::2], edges[1::2]
     k = int(np.argmax(ends - begins))
     return int(begins[k]), int(ends[k])
+
+
+def in_vessel(rims: Sequence[Ellipse], pool: Bool[np.ndarray, "h w"]) -> bool:
+    """Whether a pool lies within a rim and below it."""
+    # of an ellipse the covariance is a quarter of the square of half its axes
+    areas = [4.0 * np.pi * float(np.sqrt(np.linalg.det(rim.covariance))) for rim in rims]
+    return any(
+        rim.share_inside(pool) > IN_VESSEL and pool.sum() < BELOW_ITS_RIM * area
+        for rim, area in zip(rims, areas, strict=True)
+    )
+
+
+def fills_a_vessel(rims: Sequence[Ellipse], shown: Bool[np.ndarray, "t h w"], *, pitch: float) -> bool:
+    """Whether a thin jet falls into a vessel and what is seen of the liquid in that becomes more.
+
+    Args:
+        rims: of vessels that are seen.
+        shown: fluid pixels of some frames, spread over the clip.
+        pitch: degrees that the camera looks down.
+    """
+    for rim in rims:
+        areas = np.array([rim.share_inside(mask) * mask.sum() for mask in shown])
+        third = max(len(areas) // 3, 1)
+        if areas[-third:].mean() - areas[:third].mean() < FILLS * max(areas.mean(), 1.0):
+            continue
+        necks = [_neck_within(rim, mask, pitch) for mask in shown]
+        if np.mean(necks) > 0.5:
+            return True
+    return False
+
+
+def _neck_within(rim: Ellipse, mask: np.ndarray, pitch: float) -> bool:
+    """Whether the silhouette shows a jet above a pool that lies in a vessel."""
+    piece = largest_piece(mask)
+    neck = find_neck(piece, pitch=pitch) if piece.any() else None
+    return neck is not None and in_vessel([rim], lying_pixels(piece, airborne_pixels([neck], mask.shape)))

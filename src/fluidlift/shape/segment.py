@@ -57,7 +57,8 @@ BIAS, IN_OUTLINE, OF_SCORE, LOUDEST = 0.51, 1.75, 0.31, 8.0
 """log odds of fluid of a pixel whose score is 0 and outline unknown, for one inside an outline (against it, outside),
 per unit of the score, and the score beyond which it says no more: logistic regression on pixels of 34 real clips
 (`benchmarks/masks_fit.py` gives 1.87 and 0.30; 1.7 to 2.0 for an outline with each clip left out; held lower, so that
-nothing is sure where the loudest score speaks against it). Of what has a chance of 0.8 by it, 8 in 10 are right"""
+nothing is sure where the loudest score speaks against it). Of those pixels
+with a chance of 0.8 by it, 8 in 10 are right"""
 
 
 class LabelWriter:

@@ -72,7 +72,7 @@ def write_page_of(job: ExportJob) -> ExportOutcome:
         interval=job.interval * plan.every, numbers=tuple(FIRST_FRAME + k for k in picked),
         poster=_poster(job, first, bodies), terrain=job.asset.terrain.mesh, warnings=tuple(warnings),
         bodies=tuple(bodies), sun=tuple((LIGHT / np.linalg.norm(LIGHT)).tolist()),
-        terrain_opacity=glass_of(job.asset.kind) or 1.0,
+        terrain_opacity=glass_of(job.asset.kind, job.asset.terrain) or 1.0,
         facts=(f"{len(shown):,} splats".replace(",", " "), f"{len(picked)} frames"),
     )  # fmt: skip
     path, size = write_page(page_path(job.out), frames(True), held, scene)
@@ -176,7 +176,7 @@ def _poster(job: ExportJob, first: Gaussians, bodies: list[MovingMesh]) -> np.nd
         )
         for b in bodies
     ]
-    ground = terrain_surfels(job.asset.terrain, glass=glass_of(job.asset.kind))
+    ground = terrain_surfels(job.asset.terrain, glass=glass_of(job.asset.kind, job.asset.terrain))
     scene = concatenate([ground, *solids, first])
     picture = render(scene, camera, background=(0.08, 0.09, 0.11)).image
     return (255 * np.clip(picture, 0, 1) + 0.5).astype(np.uint8)

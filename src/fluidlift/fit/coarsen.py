@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -84,4 +86,4 @@ def coarsen_terrain(terrain: Terrain) -> Terrain:
     phi: Float[np.ndarray, "a b c"] = terrain.signed_distance
     wide = np.pad(phi, [(0, (n - 1) % 2) for n in phi.shape], mode="edge")
     nodes = np.ascontiguousarray(wide[::2, ::2, ::2])
-    return Terrain(coarse_grid(terrain.grid), nodes, terrain.mainstream, terrain.mesh)
+    return replace(terrain, grid=coarse_grid(terrain.grid), signed_distance=nodes)

@@ -363,6 +363,7 @@ def _write_terrain(folder: Path, asset: FluidAsset) -> None:
         "faces": terrain.mesh.faces,
     }
     arrays |= {k: v for k in ("colors", "uv", "texture") if (v := getattr(terrain.mesh, k)) is not None}
+    arrays |= {"opaque": np.array(True)} if terrain.opaque else {}
     with atomic_write(asset_file(folder, FILES["terrain"])) as file:
         write_packed_arrays(file, arrays)
     glb = asset_file(folder, FILES["terrain_mesh"])
@@ -381,7 +382,7 @@ def _read_terrain(path: Path) -> Terrain:
     if len(faces) and (faces.min() < 0 or faces.max() >= len(a["vertices"])):
         raise ValueError("terrain faces that name missing vertices")
     mesh = TriangleMesh(a["vertices"], faces, a.get("colors"), a.get("uv"), a.get("texture"))
-    return Terrain(grid, a["signed_distance"], a["mainstream"], mesh)
+    return Terrain(grid, a["signed_distance"], a["mainstream"], mesh, bool(a.get("opaque", False)))
 
 
 def _write_velocity(folder: Path, asset: FluidAsset) -> None:

@@ -19,7 +19,7 @@ from fluidlift.numerics.mesh_normals import vertex_normals
 from fluidlift.numerics.triangles import interpolated, rasterize_closed, rasterize_triangles
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.kind import FluidKind, kind_of
-from fluidlift.types.terrain import TriangleMesh
+from fluidlift.types.terrain import Terrain, TriangleMesh
 
 if TYPE_CHECKING:
     from fluidlift.look.environment import Environment
@@ -38,9 +38,14 @@ MOST = 12.0
 """wall thicknesses on a ray, at most: light does not run round the whole of a wall"""
 
 
-def glass_of(kind: str | FluidKind) -> float | None:
+def has_glass(kind: str | FluidKind, terrain: Terrain) -> bool:
+    """Whether what a fluid of a kind stands in lets light through."""
+    return kind_of(kind).fills_vessel and not terrain.opaque
+
+
+def glass_of(kind: str | FluidKind, terrain: Terrain) -> float | None:
     """Opacity, as surfels, of the walls of what a fluid of a kind stands in; None: they are ground as the rest."""
-    return GLASS if kind_of(kind).fills_vessel else None
+    return GLASS if has_glass(kind, terrain) else None
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ def reshaped(
         if solid is None
         else _coloured(solid, terrain)
     )
-    new = Terrain(grid, distance, place.mainstream, mesh)
+    new = replace(terrain, grid=grid, signed_distance=distance, mainstream=place.mainstream, mesh=mesh)
     cells = _moved_cells(terrain.grid, cell_types, new, place)
     outside = ~terrain.grid.contains(place.origin(grid.centers().reshape(-1, 3))).reshape(grid.shape)
     cells = _with_drains(cells, outside | (solid is not None))

@@ -269,7 +269,7 @@ def _cameras(scene: Scene, request: RenderRequest, count: int) -> list[PinholeCa
     if request.view == "input":
         return [_fitted(camera, size)] * count
     if request.view == "side":
-        ground = terrain_surfels(scene.terrain, glass=glass_of(scene.kind))
+        ground = terrain_surfels(scene.terrain, glass=glass_of(scene.kind, scene.terrain))
         return [side_camera(camera, scene.rest, ground, around, size=size)] * count
     if request.view == "top":
         return [orbit_camera(camera, around, azimuth=0.0, elevation=89.0, size=size)] * count

@@ -116,6 +116,8 @@ class Sight:
     """of vessels, as they were found"""
     steep: float = STEEP
     """degrees, scale of the prior of the slope of a stream that is not level"""
+    heeded_rims: tuple[Ellipse, ...] = ()
+    """those that a person drew, or else those that were found"""
 
     @property
     def lying_trust(self) -> np.ndarray:
@@ -282,7 +284,7 @@ def _seen(
     seen = Sight(
         start, united, mask, motion, trust, known, pose_given, evidence, kind, parts, up, heading, tilt_known, height,
         unsure, stood, config.kind == "auto", *((None, ()) if said is None else (said.flow, said.warnings)), rims,
-        steep,
+        steep, _said_of_view(config, known, mask.shape).rims or rims,
     )  # fmt: skip
     return seen, pictures
 
@@ -503,6 +505,7 @@ def _observation(seen: Sight, canonical: PinholeCamera, interval: float) -> Obse
     return Observation(
         canonical, seen.parts.lying, seen.motion, trust, interval, camera_height=seen.height,
         tilt_known=seen.tilt_known, slopes=slopes, roll=seen.up.roll, standing=seen.stood, ledges=seen.parts.ledges,
+        rims=seen.heeded_rims,
     )  # fmt: skip
 
 

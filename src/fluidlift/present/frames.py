@@ -178,12 +178,12 @@ class FrameRenderer:
     @cached_property
     def ground(self) -> Gaussians:
         """Surfels of the terrain."""
-        return terrain_surfels(self.scene.terrain, glass=glass_of(self.scene.kind), **self._most)
+        return terrain_surfels(self.scene.terrain, glass=glass_of(self.scene.kind, self.scene.terrain), **self._most)
 
     @cached_property
     def _ground_without_glass(self) -> Gaussians:
         """A vessel hides nothing of what it holds, and is ground: cut out, none of it is there."""
-        if glass_of(self.scene.kind) is None:
+        if glass_of(self.scene.kind, self.scene.terrain) is None:
             return self.ground
         return terrain_surfels(self.scene.terrain, glass=0.0, **self._most)
 

@@ -29,7 +29,7 @@ from fluidlift.look.stream_slab import Slab
 from fluidlift.look.surface_foam import FilmedWhite, with_foam
 from fluidlift.look.surface_skin import painted_liquid
 from fluidlift.look.transparent import splat_surface
-from fluidlift.look.vessel import Pane, before_glass, panes, vessel_apart
+from fluidlift.look.vessel import Pane, before_glass, has_glass, panes, vessel_apart
 from fluidlift.look.wet_ground import wetted
 from fluidlift.numerics.mesh_normals import vertex_normals
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
@@ -183,7 +183,7 @@ class Painter:
         self._panes: tuple[tuple, tuple[Pane, Pane]] | None = None
         # the ground that hides, and the glass of a pour that does not
         ground, cell = terrain.mesh, terrain.grid.spacing
-        whole, self._vessel = vessel_apart(ground, cell) if kind_of(kind).fills_vessel else (ground, None)
+        whole, self._vessel = vessel_apart(ground, cell) if has_glass(kind, terrain) else (ground, None)
         self._grounds = GroundPictures(whole, terrain.grid, self._slab, self.environment, self._quality.light)
         _ = self._final if engine == "mitsuba" else self._mesher  # what is missing is said before anything is drawn
 

@@ -66,6 +66,9 @@ def airborne_setting(
     low, high = np.percentile(body, 0.2, axis=0), np.percentile(body, 99.8, axis=0)
     if vessel is not None:  # what is seen lowest is its near side
         low[2] = vessel.floor
+        if vessel.mouth is not None:
+            around = vessel.mouth.radius * np.array([1.0, 1.0, 0.0])
+            low, high = np.minimum(low, vessel.mouth.center - around), np.maximum(high, vessel.mouth.center + around)
     extent = high - low
     spacing = extent.max() / longest
     for _ in range(80):
@@ -94,9 +97,11 @@ def airborne_setting(
     if fluid.any():
         cells[builder.inlet(fluid, centers[..., 2], h) & ~solid] = CellType.INFLOW
     cells[builder.outlet(grid.shape) & ~solid] = CellType.OUTFLOW
-    terrain = Terrain(grid, phi.astype(np.float32), unit(mainstream), terrain_mesh(grid, phi))
+    opaque = vessel is not None and vessel.looked_into
+    terrain = Terrain(grid, phi.astype(np.float32), unit(mainstream), terrain_mesh(grid, phi), opaque)
     bed = np.full(grid.shape[:2], floor)
-    return Setting(terrain, cells, None, bed, None if vessel is None else vessel.level)
+    level, mouth = (None, None) if vessel is None else (vessel.level, vessel.mouth)
+    return Setting(terrain, cells, None, bed, level, mouth)
 
 
 def inside_body(
@@ -169,7 +174,7 @@ def with_jets(
             mouth = (aside <= nozzle_radius(jet, h)) & (above > 0) & (above < MOUTH * h)
             cells[mouth & (cells != CellType.SOLID)] = CellType.INFLOW
     solid = setting.terrain
-    terrain = Terrain(taller, phi, solid.mainstream, solid.mesh)
+    terrain = replace(solid, grid=taller, signed_distance=phi)
     return replace(setting, terrain=terrain, cell_types=cells)
 
 

@@ -3,6 +3,7 @@
 Of a circle at height z and distance d from the eye the silhouette shows the half width r / sqrt(1 - (r/d)^2) in the
 vertical plane through the axis; its nearest point, at d - r, appears there at z d / (d - r) from the level of the eye.
 So floor and level follow from the lowest and highest rows of the silhouette, and the radius from the rows between.
+Of a vessel that is looked into its rim tells more (`looked_into`).
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from fluidlift.shape.jets import airborne_pixels, find_neck, lying_pixels
+from fluidlift.shape.looked_into import Level, level_below, rim_circle, seen_through
 from fluidlift.shape.region import largest_piece
 from fluidlift.shape.view.roundness import IN_VESSEL, Ellipse
-from fluidlift.types import PinholeCamera, Similarity3, triple
+from fluidlift.types import PinholeCamera, Similarity3, VesselRim, triple
 
 NARROW = 0.55
 """of the widest row, at most: the jet that falls in. A jet that fills half of its glass is rare, and a body that is as
@@ -41,6 +43,15 @@ DEEP = 1.0
 """radii that such a pool is taken to be deep: as a half sphere is, between a plate and a mug"""
 FREEBOARD = 0.1
 """radii that the edge of such a vessel stands above the level at least, which it would run over"""
+CUP, BELOW_LEVEL = 1.2, 0.3
+"""radii of its rim that a vessel which is looked into is taken to be deep (a choice: bowls have 0.6 to 1, cups 1.2 to
+1.6), and that its floor lies below the level at least"""
+MOSTLY = 0.5
+"""of what is seen within a rim, at least, that lies in its lower half: a level below it is seen there"""
+THICK = 1.15
+"""radii of its outside over those of its inside: mugs have walls of a seventh, and cells are coarse"""
+FOOT_RADIUS = 0.5
+"""of its rim's radius, that of its floor at least"""
 SMOOTH = 0.015
 """of the silhouette's height over which its outline is evened out: drops and notches of a mask"""
 TURNS, RADII = 17, 96
@@ -75,6 +86,8 @@ class FilledVessel:
     """only its surface is seen: its near wall hides the rest of what it holds"""
     edge: float | None = None
     """z of its upper edge where that is seen, by what it hides"""
+    mouth: VesselRim | None = None
+    """its rim where that is seen: the radii are known up to it"""
 
     @property
     def floor(self) -> float:
@@ -124,10 +137,13 @@ class FilledVessel:
     def transformed(self, t: Similarity3) -> FilledVessel:
         """As a similarity that keeps the vertical moves it."""
         low = t.points(np.array([[*self.axis, 0.0]]))[0]
+        mouth = self.mouth
+        if mouth is not None:
+            mouth = VesselRim(triple(t.points(np.array([mouth.center]))[0]), t.scale * mouth.radius)
         return FilledVessel(
             (float(low[0]), float(low[1])), low[2] + t.scale * self.heights, t.scale * self.radii,
             float(low[2] + t.scale * self.level), triple(t.rotation @ self.inflow), self.looked_into,
-            None if self.edge is None else float(low[2] + t.scale * self.edge),
+            None if self.edge is None else float(low[2] + t.scale * self.edge), mouth,
         )  # fmt: skip
 
 
@@ -143,13 +159,21 @@ def distance_ahead(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], middle:
     return float(np.median(middle[mask] * (rays[:, :2] @ _level_axes(camera)[1])))
 
 
-def find_vessel(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], distance: float) -> FilledVessel | None:
+def find_vessel(
+    camera: PinholeCamera,
+    mask: Bool[np.ndarray, "h w"],
+    distance: float,
+    rims: Sequence[Ellipse] = (),
+    mouth: VesselRim | None = None,
+) -> FilledVessel | None:
     """The vessel in which the lower part of a silhouette stands, if a much narrower jet falls into it; else None.
 
     Args:
         camera: its tilt and roll as known.
         mask: fluid pixels.
         distance: from the camera to the axis along the ground, in the unit of the result.
+        rims: of vessels that are seen. The one that holds the lower part of the silhouette tells its vessel.
+        mouth: that one, where it is known.
     """
     if abs(camera.camera_from_world.rotation[2, 2]) > STEEPEST_VIEW:
         return None
@@ -157,6 +181,13 @@ def find_vessel(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], distance: 
     plane = _Rectified.of(camera, mask, eye, right, forward, distance)
     if plane is None:
         return None
+    if mouth is None:
+        held = next((rim for rim in rims if holds_pool(rim, mask)), None)
+        mouth = None if held is None else rim_circle(camera, held, distance)
+    level = None if mouth is None else level_below(mouth, camera, mask)
+    if mouth is not None and level is not None:
+        above = np.flatnonzero(plane.z > (level.z - eye[2]) * distance / (distance + level.radius))
+        return _below_rim(mouth, level, plane.lean(int(above[0])) * right if len(above) else 0.0 * right)
     first, last = plane.pool()
     count = len(plane.z)
     if not PARTS[0] * count <= last - first <= PARTS[1] * count or first > BELOW * count:
@@ -187,6 +218,19 @@ def find_vessel(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], distance: 
     )  # fmt: skip
 
 
+def _below_rim(mouth: VesselRim, level: Level, lean: np.ndarray) -> FilledVessel:
+    """A cone through a rim's inner edge and a level circle; `lean`: way along the ground over height of its jet."""
+    x, y, edge = mouth.center
+    taper = (level.inner - level.radius) / max(edge - level.z, 1e-9)
+    floor = min(edge - CUP * mouth.radius, level.z - BELOW_LEVEL * mouth.radius)
+    foot = max(level.radius - taper * (level.z - floor), min(FOOT_RADIUS * mouth.radius, level.radius))
+    heights, radii = np.array([floor, level.z, edge]), np.array([foot, level.radius, level.inner])
+    way = np.array([*-lean, -1.0])
+    kept = np.concatenate([[True], np.diff(heights) > 1e-9])  # a level at the rim itself is one height
+    inflow = triple(way / np.linalg.norm(way))
+    return FilledVessel((x, y), heights[kept], radii[kept], level.z, inflow, True, edge, mouth)
+
+
 def behind_its_wall(
     vessel: FilledVessel, camera: PinholeCamera, ever: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
@@ -199,7 +243,11 @@ def behind_its_wall(
     """
     if not vessel.looked_into:
         return np.zeros(ever.shape, bool)
-    return np.isfinite(pool_depths(camera, np.ones(ever.shape, bool), vessel)[0]) & ~ever
+    whole = np.ones(ever.shape, bool)
+    if vessel.mouth is None:
+        return np.isfinite(pool_depths(camera, whole, vessel)[0]) & ~ever
+    brimful = replace(vessel, level=vessel.rim, radii=THICK * vessel.radii)
+    return np.isfinite(pool_depths(camera, whole, brimful)[0]) & ~seen_through(vessel.mouth, camera)
 
 
 def seen_higher(vessel: FilledVessel, camera: PinholeCamera, ever: Bool[np.ndarray, "h w"]) -> FilledVessel:
@@ -213,6 +261,8 @@ def seen_higher(vessel: FilledVessel, camera: PinholeCamera, ever: Bool[np.ndarr
         camera: in the same world.
         ever: pixels that are fluid in at least one frame.
     """
+    if vessel.mouth is not None:  # its radii are known up to its rim
+        return vessel
     found = find_vessel(camera, ever, _ahead(vessel, camera))
     if found is None:
         return vessel
@@ -231,6 +281,9 @@ def filled_volume(vessel: FilledVessel, camera: PinholeCamera, mask: Bool[np.nda
         camera: in the world.
         mask: fluid pixels.
     """
+    if vessel.mouth is not None:
+        found = level_below(vessel.mouth, camera, mask, vessel.radius_at)
+        return None if found is None else replace(vessel, level=max(found.z, vessel.floor)).volume
     found = find_vessel(camera, mask, _ahead(vessel, camera))
     return None if found is None else replace(vessel, level=max(found.level, vessel.floor)).volume
 
@@ -383,6 +436,16 @@ def in_vessel(rims: Sequence[Ellipse], pool: Bool[np.ndarray, "h w"]) -> bool:
         rim.share_inside(pool) > IN_VESSEL and pool.sum() < BELOW_ITS_RIM * area
         for rim, area in zip(rims, areas, strict=True)
     )
+
+
+def holds_pool(rim: Ellipse, mask: Bool[np.ndarray, "h w"]) -> bool:
+    """Whether a silhouette lies within a rim and below it, but for what comes from above."""
+    inside = rim.share_inside(mask)
+    lower = mask & (np.arange(len(mask))[:, None] + 0.5 > rim.center[1])
+    # of an ellipse the covariance is a quarter of the square of half its axes
+    area = 4.0 * np.pi * float(np.sqrt(np.linalg.det(rim.covariance)))
+    below = lower.any() and rim.share_inside(lower) > IN_VESSEL and lower.sum() > MOSTLY * inside * mask.sum()
+    return bool(below and inside * mask.sum() < BELOW_ITS_RIM * area)
 
 
 def fills_a_vessel(rims: Sequence[Ellipse], shown: Bool[np.ndarray, "t h w"], *, pitch: float) -> bool:

@@ -37,7 +37,7 @@ from fluidlift.types.kind import KINDS, FluidKind, kind_of
 from fluidlift.types.parameters import GRAVITY, Estimate, FluidParameters
 from fluidlift.types.particles import Particles
 from fluidlift.types.results import FitResult, SolveReport
-from fluidlift.types.terrain import Setting, Terrain, TriangleMesh
+from fluidlift.types.terrain import Setting, Terrain, TriangleMesh, VesselRim
 from fluidlift.types.transforms import RigidTransform, Similarity3, matrix_from_quat, quat_from_matrix
 
 __all__ = [
@@ -76,6 +76,7 @@ __all__ = [
     "Terrain",
     "TriangleMesh",
     "UpEvidence",
+    "VesselRim",
     "VideoClip",
     "ViewKey",
     "camera",

@@ -38,6 +38,14 @@ class TriangleMesh:
 
 
 @dataclass(frozen=True)
+class VesselRim:
+    """The rim of a vessel that a pour fills: a level circle."""
+
+    center: tuple[float, float, float]
+    radius: float
+
+
+@dataclass(frozen=True)
 class Terrain:
     """Bed, banks and rocks."""
 
@@ -48,6 +56,8 @@ class Terrain:
     """unit direction of the bulk flow in the world"""
     mesh: TriangleMesh
     """the surface of the solid, for pictures and export"""
+    opaque: bool = False
+    """of a pour: its vessel hides what it holds, where glass does not"""
 
     def __post_init__(self) -> None:
         shape = tuple(n + 1 for n in self.grid.shape)
@@ -67,3 +77,5 @@ class Setting:
     """z of the ground under each column, m"""
     pool_level: float | None = None
     """z below which a pour stands in its vessel, m"""
+    rim: VesselRim | None = None
+    """of that vessel where it is looked into, m"""

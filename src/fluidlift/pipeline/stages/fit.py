@@ -226,7 +226,7 @@ def filling_rate(read: Read, masks: FluidMasks, geometry: Geometry) -> float | N
         return None
     clip, camera, mask = read.clip, geometry.camera, geometry.mask
     ahead = distance_ahead(camera, mask, geometry.depth + geometry.half_thickness)
-    vessel = find_vessel(camera, mask, ahead)
+    vessel = find_vessel(camera, mask, ahead, mouth=geometry.setting.rim)
     if vessel is None:
         return None
     vessel = seen_higher(vessel, camera, masks.any_frame())

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from fluidlift.shape.slope import SlopePrior
     from fluidlift.shape.standing import StandingBody
     from fluidlift.shape.surface import FrontSurface
+    from fluidlift.shape.view.roundness import Ellipse
     from fluidlift.types import PinholeCamera
 
 
@@ -44,6 +45,8 @@ class Observation:
     """of a fluid that starts at rest"""
     ledges: Bool[np.ndarray, "h w"] | None = None
     """pixels of what comes down steeply onto the rest, as a person marked them"""
+    rims: tuple[Ellipse, ...] = ()
+    """of vessels, px"""
 
 
 class BodyBuilder(Protocol):

@@ -8,6 +8,7 @@ import numpy as np
 
 from fluidlift.shape import depth_surface, surface
 from fluidlift.shape.filled_vessel import distance_ahead, find_vessel, pool_depths
+from fluidlift.shape.kinds.base import Observation
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.types.kind import POUR
 
@@ -22,11 +23,11 @@ class _Pour:
     side, above = 0.35, 0.1
 
     def front_surface(self, seen):
-        return _with_pool(surface.inflated_surface(seen.camera, seen.mask, POUR, seen.roll), seen.camera, seen.mask)
+        return _with_pool(surface.inflated_surface(seen.camera, seen.mask, POUR, seen.roll), seen)
 
     def depth_surface(self, scene, seen, slopes, usual):
         front = depth_surface.airborne_surface(scene, seen.camera, seen.mask, POUR)
-        return _with_pool(front, seen.camera, seen.mask), None
+        return _with_pool(front, seen), None
 
     def mainstream(self, bulk):
         """Down, with the lean that is seen: how fast it comes nearer is read from a surface that was made round."""
@@ -52,9 +53,10 @@ class _Pour:
         return sides
 
 
-def _with_pool(front: FrontSurface, camera, mask) -> FrontSurface:
+def _with_pool(front: FrontSurface, seen: Observation) -> FrontSurface:
     """The surface of a pour, with what stands in a vessel below its jet as a solid of revolution."""
-    vessel = find_vessel(camera, mask, distance_ahead(camera, mask, front.depth + front.half_thickness))
+    camera, mask = seen.camera, seen.mask
+    vessel = find_vessel(camera, mask, distance_ahead(camera, mask, front.depth + front.half_thickness), seen.rims)
     if vessel is None:
         return front
     near, far = pool_depths(camera, mask, vessel)

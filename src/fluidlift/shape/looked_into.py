@@ -1,0 +1,138 @@
+"""What a rim says of a vessel that is looked into: where it stands, how wide it is, and how high the liquid in it is.
+
+A rim that lies level is a circle about the vessel's axis. Its ellipse in the picture, carried onto level planes below a
+level camera, is one in each of them: how far away it is decides its height and its radius. What is seen of a liquid in
+it is the part of a lower level circle that the near part of the rim does not hide: of a silhouette, the lower edge is
+the rim's and the upper one the far arc of that circle, which tells both its height and its radius.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fluidlift.shape.view.roundness import Ellipse
+from fluidlift.types import PinholeCamera, VesselRim
+
+DEEPEST, STEP = 1.6, 0.02
+"""radii of the rim that a level lies below it at most (mugs are that deep), and between two that are tried"""
+NARROWEST = 0.4
+"""of the rim's radius, that of a level circle at least"""
+INNER = (1.0, 0.95, 0.9, 0.85)
+"""of the rim's radius, that of its inner edge: an ellipse may be of its outer one, and mugs are a seventh thick"""
+LIKENESS = 0.6
+"""IoU of what is seen within a rim with the level circle that fits it best, from which that is believed: waves and
+splashes are the rest (a choice)"""
+JET = 0.55
+"""of the widest row, at most: rows above it that show the jet, which hides the wall and the level alike"""
+TURNS = 64
+"""places on a circle"""
+
+
+@dataclass(frozen=True)
+class Level:
+    """The level circle of a liquid in a vessel."""
+
+    z: float
+    radius: float
+    inner: float
+    """radius of the rim's inner edge, which hides what is nearer"""
+
+
+def rim_circle(camera: PinholeCamera, rim: Ellipse, distance: float) -> VesselRim | None:
+    """The level circle that an ellipse shows; None where it reaches up to the horizon.
+
+    Args:
+        camera: its tilt and roll as known.
+        rim: in the picture, px.
+        distance: from the camera to the circle's center along the ground.
+    """
+    turn = np.linspace(0.0, 2.0 * np.pi, TURNS, endpoint=False)
+    values, axes = np.linalg.eigh(rim.covariance)
+    outline = rim.center + 2.0 * (np.stack([np.cos(turn), np.sin(turn)], axis=-1) * np.sqrt(values)) @ axes.T
+    rays = camera.rays(outline)
+    if (rays[:, 2] > -1e-3).any():
+        return None
+    flat = rays[:, :2] / -rays[:, 2:]  # on the plane one below the eye
+    terms = np.column_stack([2.0 * flat, np.ones(TURNS)])
+    x, y, rest = np.linalg.lstsq(terms, np.square(flat).sum(axis=1), rcond=None)[0]
+    away, radius = float(np.hypot(x, y)), float(np.sqrt(max(rest + x * x + y * y, 0.0)))
+    if away < 1e-6:  # straight below: no way along the ground tells how far
+        return None
+    scale = distance / away
+    eye = camera.position
+    return VesselRim((eye[0] + scale * x, eye[1] + scale * y, eye[2] - scale), scale * radius)
+
+
+def at_height(camera: PinholeCamera, z: float) -> Float[np.ndarray, "h w 2"]:
+    """x, y at which the ray of each pixel meets a level plane below the camera; inf where it looks up."""
+    rays = camera.rays(camera.pixel_grid())
+    down = rays[..., 2] < -1e-6
+    flat = rays[..., :2] / np.where(down, -rays[..., 2], 1.0)[..., None]
+    return np.where(down[..., None], camera.position[:2] + (camera.position[2] - z) * flat, np.inf)
+
+
+def seen_through(rim: VesselRim, camera: PinholeCamera) -> Bool[np.ndarray, "h w"]:
+    """Pixels that look through a rim."""
+    return np.hypot(*np.moveaxis(at_height(camera, rim.center[2]) - rim.center[:2], -1, 0)) < rim.radius
+
+
+def level_below(
+    rim: VesselRim,
+    camera: PinholeCamera,
+    mask: Bool[np.ndarray, "h w"],
+    radius_at: Callable[[Float[np.ndarray, " k"]], Float[np.ndarray, " k"]] | None = None,
+) -> Level | None:
+    """The level circle whose part within the rim's inner edge a silhouette shows; None where none fits it.
+
+    Args:
+        rim: in the camera's world.
+        camera: that sees it.
+        mask: fluid pixels, with the jet that falls in.
+        radius_at: of the inside at heights z; None: it is read from the silhouette as well.
+    """
+    center, eye = np.asarray(rim.center), camera.position
+    within = seen_through(rim, camera) & ~_jet(mask)
+    wet = mask[within]
+    if not wet.any():
+        return None
+    there = at_height(camera, center[2])[within]
+    at_rim, flat = np.hypot(*(there - center[:2]).T) / rim.radius, (there - eye[:2]) / (eye[2] - center[2])
+    best, found = LIKENESS, None
+    for below in np.arange(0.0, DEEPEST, STEP):
+        z = center[2] - below * rim.radius
+        away = np.hypot(*(eye[:2] + (eye[2] - z) * flat - center[:2]).T)
+        tried = None if radius_at is None else float(radius_at(np.array([z]))[0])
+        for inner in INNER:
+            open_ = at_rim < inner
+            likeness, radius = _best_circle(away[open_], wet[open_], int(wet.sum()), rim.radius, tried)
+            if likeness > best:
+                best, found = likeness, Level(float(z), min(radius, inner * rim.radius), inner * rim.radius)
+    return found
+
+
+def _jet(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels of a silhouette's narrow rows above its widest one."""
+    width = mask.sum(axis=1)
+    narrow = width < JET * float(np.percentile(width[width > 0], 95)) if width.any() else width < 0
+    narrow[int(np.argmax(width)) :] = False
+    return mask & narrow[:, None]
+
+
+def _best_circle(
+    away: np.ndarray, wet: np.ndarray, count: int, largest: float, radius: float | None
+) -> tuple[float, float]:
+    """IoU of `count` wet pixels with those less `away` from an axis than a radius, the best one where None is given."""
+    if not len(away):
+        return 0.0, 0.0
+    order = np.argsort(away)
+    both, away = np.cumsum(wet[order]), away[order]
+    likeness = both / (count + np.arange(1, len(away) + 1) - both)
+    tried = (away > NARROWEST * largest) & (away < largest) if radius is None else away < radius
+    if not tried.any():
+        return 0.0, 0.0
+    at = int(np.argmax(np.where(tried, likeness, 0.0))) if radius is None else int(np.flatnonzero(tried)[-1])
+    return float(likeness[at]), float(away[at])

@@ -220,6 +220,12 @@ def test_output_goes_to_new_empty_or_own_folders_only(tmp_path, folder):
             af.check_output_folder(tmp_path / name)
 
 
+def test_whether_a_vessel_hides_what_it_holds_is_kept(tmp_path, asset):
+    assert not af.load_asset(af.save_asset(tmp_path / "glass.fluid", asset)).terrain.opaque
+    cup = replace(asset, terrain=replace(asset.terrain, opaque=True))
+    assert af.load_asset(af.save_asset(tmp_path / "cup.fluid", cup)).terrain.opaque
+
+
 def test_a_fluid_without_terrain_faces_can_be_saved(tmp_path, asset):
     from dataclasses import replace
 

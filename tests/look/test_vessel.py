@@ -1,6 +1,7 @@
 """A pour's vessel is glass: it is told from its table, and shows what it holds."""
 
 from collections import Counter
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -195,3 +196,18 @@ def test_path_traced_panes_take_no_light_from_a_white_world(monkeypatch):
     # a white floor below a pane: light comes to it through the pane, and through it to the camera. 256 paths of a
     # spread of about 0.3 over 384 pixels
     assert MitsubaRenderer("scalar_rgb").picture(scene).mean() == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_vessel_that_is_looked_into_is_no_glass():
+    terrain = pour()
+    assert glass.glass_of("pour", terrain) == glass.GLASS
+    opaque = replace(terrain, opaque=True)
+    assert glass.glass_of("pour", opaque) is None and glass.glass_of("stream", terrain) is None
+    look = Look("surface", "milk", "white")
+    clear, hidden = (
+        Painter(look, t, Path(), kind="pour").picture(
+            Frame(water(), np.zeros_like(water().means)), beside(), Backdrop()
+        ).image[42:50, 28:44].mean()
+        for t in (terrain, opaque)
+    )  # fmt: skip
+    assert clear > hidden + 0.3, "milk behind the front wall"

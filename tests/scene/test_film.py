@@ -147,6 +147,26 @@ def test_what_pours_or_stands_is_as_wide_as_each_frame_shows_it(channel, tmp_pat
     assert min(edited) > max(seen), "where somebody changes how it flows it is where it flows"
 
 
+def test_what_the_wall_of_a_vessel_hides_looks_as_what_is_seen_of_it(channel, tmp_path):
+    """The film shows dark fluid on the left and a white wall on the right, which stands before the rest of it."""
+    count = 8
+    wet = np.zeros((count, 48, 64), bool)
+    wet[..., :32] = True
+    frames = np.where(wet[..., None], 60, 230).astype(np.uint8).repeat(3, axis=-1)
+    scene = channel(count, kind="pour", film=write_footage(tmp_path / "film.mp4", frames, wet, 0.04))
+    x, _, z = np.moveaxis(scene.terrain.grid.nodes(), -1, 0)
+    lid = np.maximum(0.6 - x, np.abs(z - 0.5) - 0.06)
+    solid = np.minimum(scene.terrain.signed_distance, lid).astype(np.float32)
+    scene = replace(scene, terrain=replace(scene.terrain, signed_distance=solid, opaque=True))
+    appearance, particles = SurfaceAppearance(scene), simulator_of(scene).particles
+    appearance.advance(particles, 0)
+    shown = appearance.dressed(particles, 0)
+    hidden, skin = particles.positions[:, 0] > 0.75, shown.ids % 2 == 1
+    body = shown.gaussians.select(~skin)
+    assert np.abs(body.rgb[hidden] - 60 / 255).max() < 0.1 and body.opacities[hidden].min() > 0.5
+    assert shown.gaussians.means[skin][:, 0].max() < 0.75, "no skin lies on what the wall hides"
+
+
 @pytest.mark.parametrize("kind", ["stream", "fall"])
 def test_what_sways_is_seen_where_its_film_shows_it_at_that_instant(channel, tmp_path, kind):
     """Beside the fluid of an instant its skin and its body are there, and are not seen."""

@@ -41,7 +41,8 @@ def before_ground(scene: Scene, footage: Footage | None) -> Callable[[Gaussians]
     ground = rocks | ~footage.labels.fluid.any(axis=0) if kind_of(scene.kind).lies_on_ground else rocks
     if not ground.any():
         return None
-    margin = scene.terrain.grid.spacing * np.where(rocks, *BEHIND)
+    guessed = rocks & (not scene.terrain.opaque)  # a vessel's wall is where its rim says
+    margin = scene.terrain.grid.spacing * np.where(guessed, *BEHIND)
     depth = terrain_depth(scene.terrain, scene.camera)
     if before is not None:
         depth = np.where(before, -np.inf, depth)

@@ -78,6 +78,9 @@ TINTED = 1.5
 """cells about the surface within which particles wear the skin's colours; before a surface that is a map over the
 picture, all do"""
 
+BEHIND_WALL = 0.5
+"""cells behind the wall of a vessel from which something is hidden by it: half of the step of a wall of cells"""
+
 CLEAR = 0.1
 """cells from the ground within which the skin is left out"""
 
@@ -201,6 +204,8 @@ class SurfaceAppearance:
         """frames of the film per frame of the scene"""
         self._level: float | None = None
         self._plays = False
+        self._wall: np.ndarray | None = None
+        """[h,w], camera depth (m) of a vessel's wall that hides what it holds; None: nothing is hidden so"""
         self._tracers = 0
         self._smoke: SmokeAppearance | None = None
         self._own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
@@ -300,6 +305,8 @@ class SurfaceAppearance:
 
     def _film_of(self, own: Gaussians) -> FluidFootage | None:
         """The film that the surface plays, whose size the camera has from here on; one that cannot be is a warning."""
+        from fluidlift.look.scenery import terrain_depth
+
         scene = self._scene
         if scene.film is None:
             return None
@@ -308,6 +315,8 @@ class SurfaceAppearance:
             self._missing = (Notice("film-not-played", f"the film of the fluid {found}"),)
             return None
         self._camera = scene.camera.resized((found.mean.shape[1], found.mean.shape[0]))
+        if scene.terrain.opaque:
+            self._wall = terrain_depth(scene.terrain, self._camera)
         return found
 
     def _level_at(self, places: np.ndarray) -> np.ndarray:
@@ -354,7 +363,7 @@ class SurfaceAppearance:
         from fluidlift.look.surface_map import MARGIN, SurfaceMap
 
         points = self._axes.points(particles.positions)
-        shown = self._axes.shown(points)
+        shown = self._axes.shown(points) & ~self._hidden(particles.positions)
         if not shown.any():
             return None
         moving = self._axes.velocities(particles.positions, particles.velocities)
@@ -363,6 +372,13 @@ class SurfaceAppearance:
         if self._level is not None:
             surface = levelled(surface, self._level, CALM * self._cell)
         return surface if self._outline is None else self._outline.cut(surface, self._axes)
+
+    def _hidden(self, points: np.ndarray) -> np.ndarray:
+        """Which points (m) lie behind the wall of a vessel, where the film shows that and not the fluid."""
+        if self._wall is None:
+            return np.zeros(len(points), bool)
+        row, col, depth = self._camera.nearest_pixels(points)
+        return depth > self._wall[row, col] + BEHIND_WALL * self._cell
 
     def _begin_again(self) -> None:
         from fluidlift.look.surface_skin import SurfaceSkin
@@ -480,7 +496,8 @@ class SurfaceAppearance:
         below, spray = COVERED
         loose, presence = smoothstep(above, *spray), surface.presence(xy)
         covered = smoothstep(above, *below) * (1 - loose) * (presence > 0.5)
-        loose = np.where(presence > LONELY, loose, 1.0)
+        hidden = self._hidden(particles.positions)
+        loose = np.where((presence > LONELY) | hidden, loose * ~hidden, 1.0)
         room = REACH * np.maximum(self._clearance(shown.means) + CLEAR * self._cell, CLEAR * self._cell)
         drop = DROP * self._cell
         if self._outline is not None:  # drops before what plays its film are as sharp as that
@@ -489,16 +506,19 @@ class SurfaceAppearance:
         room = np.minimum(room, drop * loose + LARGEST * self._cell * (1 - loose))
         if self._outline is not None:
             filmed = self._outline.room(shown.means)
-            covered = np.where(filmed > 0, covered, 1.0)
-            room = np.minimum(room, np.maximum(filmed, SMALLEST * self._cell))
+            covered = np.where((filmed > 0) | hidden, covered, 1.0)
+            room = np.where(hidden, room, np.minimum(room, np.maximum(filmed, SMALLEST * self._cell)))
+        covered = covered * ~hidden
         scales = np.minimum(shown.scales, room[:, None]).astype(np.float32)
         opacities = np.minimum(shown.opacities, np.maximum(shown.opacities * (1 - covered), FAINT)).astype(np.float32)
         sh, own = shown.sh.copy(), self._own_colors(particles.source)
         # what is in the air before a surface shows the film where it is seen, as on a map over the picture it always is
         deepest = np.inf if self._outline is not None or isinstance(axes, PictureAxes) else TINTED
-        near = np.flatnonzero((above > -TINTED) & (above < deepest) & (covered < 1) & ~own)
+        near = np.flatnonzero((above > -TINTED) & (above < deepest) & (covered < 1) & ~own & ~hidden)
         color, there, _ = patches.colors(rows(places, near))
         sh[near[there], :1] = sh_from_rgb(color[there])
+        if hidden.any() and there.any():  # what nobody sees looks as what is seen of it does
+            sh[hidden & ~own, :1] = sh_from_rgb(np.median(color[there], axis=0, keepdims=True))
         points = skin.points(surface)
         color, there, covers = patches.colors(points)
         color = dyed(color, points, surface, replace(shown, means=axes.points(shown.means)), own, self._cell)

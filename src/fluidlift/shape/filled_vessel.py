@@ -247,7 +247,8 @@ def behind_its_wall(
     if vessel.mouth is None:
         return np.isfinite(pool_depths(camera, whole, vessel)[0]) & ~ever
     brimful = replace(vessel, level=vessel.rim, radii=THICK * vessel.radii)
-    return np.isfinite(pool_depths(camera, whole, brimful)[0]) & ~seen_through(vessel.mouth, camera)
+    opening = VesselRim(vessel.mouth.center, float(vessel.radius_at(np.array([vessel.rim]))[0]))
+    return np.isfinite(pool_depths(camera, whole, brimful)[0]) & ~seen_through(opening, camera)
 
 
 def seen_higher(vessel: FilledVessel, camera: PinholeCamera, ever: Bool[np.ndarray, "h w"]) -> FilledVessel:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.shape.view.roundness import Ellipse
-from fluidlift.types import PinholeCamera, VesselRim
+from fluidlift.types import PinholeCamera, VesselRim, triple
 
 DEEPEST, STEP = 1.6, 0.02
 """radii of the rim that a level lies below it at most (mugs are that deep), and between two that are tried"""
@@ -63,8 +63,7 @@ def rim_circle(camera: PinholeCamera, rim: Ellipse, distance: float) -> VesselRi
     if away < 1e-6:  # straight below: no way along the ground tells how far
         return None
     scale = distance / away
-    eye = camera.position
-    return VesselRim((eye[0] + scale * x, eye[1] + scale * y, eye[2] - scale), scale * radius)
+    return VesselRim(triple(camera.position + scale * np.array([x, y, -1.0])), scale * radius)
 
 
 def at_height(camera: PinholeCamera, z: float) -> Float[np.ndarray, "h w 2"]:

@@ -11,13 +11,15 @@ from fluidlift.shape.filled_vessel import (
     behind_its_wall,
     filled_volume,
     find_vessel,
+    look_of_vertices,
     pool_depths,
     seen_higher,
 )
+from fluidlift.shape.ground_mesh import VertexLook, ground_colours
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.looked_into import level_below, rim_circle, seen_through
 from fluidlift.shape.view.roundness import Ellipse, fit_ellipse
-from fluidlift.types import PinholeCamera, Similarity3, UpEvidence, VesselRim
+from fluidlift.types import PinholeCamera, Similarity3, TriangleMesh, UpEvidence, VesselRim
 
 AWAY, RADIUS, TAPER = 2.0, 0.25, 0.3
 """m to the axis along the ground, of the rim's inner edge, and radius lost per height"""
@@ -131,3 +133,40 @@ def test_a_rim_says_nothing_of_a_pool_beside_it_or_of_one_that_is_as_wide():
     for mask, other in ((shown(camera, truth), beside), (brimful, rim)):
         found = find_vessel(camera, mask, AWAY, [other])
         assert found is None or found.mouth is None
+
+
+def test_the_look_of_its_wall_is_read_within_it_and_ground_behind_it_is_not_seen():
+    camera, vessel = camera_at(35.0), cup(0.2, outer=1.12)
+    assert vessel.mouth is not None
+    thickness, turns = 0.1, np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
+    ring = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    z = EDGE - 0.15
+    outside = float(vessel.radius_at(np.array([z]))[0]) + thickness
+    wall = np.column_stack([vessel.axis + outside * ring, np.full(40, z)])
+    floor = vessel.floor
+    behind, before = np.array([0.1, AWAY + 0.5, floor]), np.array([0.1, AWAY - 0.6, floor])
+    found = look_of_vertices(vessel, camera, np.concatenate([wall, [behind, before]]), thickness)
+    away = np.linalg.norm(found.places[:40, :2] - vessel.axis, axis=1)
+    np.testing.assert_allclose(away, outside - thickness + 0.5 * 0.12 * RADIUS, atol=1e-6)
+    np.testing.assert_array_equal(found.places[40:], [behind, before])
+    assert found.stands.tolist() == [True] * 40 + [False] * 2
+    assert found.covered.tolist() == [False] * 40 + [True, False]
+
+
+def test_ground_that_a_vessel_hides_goes_on_as_the_ground_beside_it():
+    camera = camera_at(60.0)
+    z = -AWAY * np.tan(np.radians(60.0))
+    vertices = np.array([[x, AWAY + y, z] for y in (-0.3, 0.0, 0.3) for x in (-0.3, 0.0, 0.3)] + [[0.0, AWAY, z + 0.1]])
+    plate = np.full((240, 240, 3), 50, np.uint8)
+    row, col, _ = camera.nearest_pixels(vertices[[4, 9]])
+    for r, c in zip(row, col, strict=True):
+        plate[r - 4 : r + 5, c - 4 : c + 5] = 250  # the vessel, and before the middle of the ground, too
+    mesh = TriangleMesh(vertices, np.array([[0, 1, 3], [1, 2, 4], [3, 4, 6], [4, 5, 7], [5, 8, 7], [9, 0, 1]]))
+    nothing = np.arange(10) < 0
+    plain = ground_colours(mesh, plate, camera)
+    assert plain[4].min() > 0.9
+    covered, stands = nothing.copy(), nothing.copy()
+    covered[4], stands[9] = True, True
+    found = ground_colours(mesh, plate, camera, VertexLook(vertices, covered, stands))
+    assert found[4].max() < 0.25 and found[9].min() > 0.9
+    np.testing.assert_array_equal(np.delete(found, 4, axis=0), np.delete(plain, 4, axis=0))

@@ -27,6 +27,8 @@ SIDES = ((24.0, 65.0), (24.0, -65.0), (45.0, 65.0), (45.0, -65.0))
 """elevation and azimuth, degrees, of views from the side, the usual one first"""
 SEEN = 0.6
 """share of the fluid's picture that the ground may not hide, from which a view will do"""
+UNDERSIDE = 1.0
+"""cells above its lowest vertex from which on a ground has no underside: the slab of a pour is three cells thick"""
 SKETCH = 96
 """px, width of the pictures in which that is looked at"""
 MARCH = 96
@@ -69,7 +71,9 @@ def terrain_surfels(
     normals = vertex_normals(mesh)
     h = np.clip(np.sqrt(_vertex_areas(mesh)), 0.25 * terrain.grid.spacing, terrain.grid.spacing)
     colors = np.full((len(normals), 3), 0.5) if mesh.colors is None else mesh.colors
-    seen = normals[:, 2] > -0.3  # nobody looks at the underside, and its large faces stick out at the rim
+    # nobody looks at the underside, and its large faces stick out at the rim; walls of a vessel may lean outwards
+    stands = terrain.opaque & (mesh.vertices[:, 2] > mesh.vertices[:, 2].min() + UNDERSIDE * terrain.grid.spacing)
+    seen = (normals[:, 2] > -0.3) | stands
     return _surfels(mesh.vertices[seen], normals[seen], h[seen], colors[seen], opacity)
 
 

@@ -16,8 +16,9 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from fluidlift.shape.ground_mesh import VertexLook
 from fluidlift.shape.jets import airborne_pixels, find_neck, lying_pixels
-from fluidlift.shape.looked_into import Level, level_below, rim_circle, seen_through
+from fluidlift.shape.looked_into import Level, jet_rows, level_below, rim_circle, seen_through
 from fluidlift.shape.region import largest_piece
 from fluidlift.shape.view.roundness import IN_VESSEL, Ellipse
 from fluidlift.types import PinholeCamera, Similarity3, VesselRim, triple
@@ -63,6 +64,9 @@ ACROSS = 64
 BELOW_ITS_RIM = 0.8
 """of a rim's disc that a pool fills at most, where the wall shows above it: the outline of what fills more may be the
 pool's own"""
+FAR_WALL = 0.15
+"""of the far half of a rim's disc, from which what a pool leaves free there and not on the near side is wall above it:
+outlines of pools err by a few hundredths, on all sides (a choice)"""
 FILLS = 0.1
 """of what is seen of a liquid in a vessel on average, by which it is more in the last third of a clip than in the first
 where the vessel fills (a choice: outlines err by a few hundredths)"""
@@ -243,12 +247,48 @@ def behind_its_wall(
     """
     if not vessel.looked_into:
         return np.zeros(ever.shape, bool)
-    whole = np.ones(ever.shape, bool)
     if vessel.mouth is None:
-        return np.isfinite(pool_depths(camera, whole, vessel)[0]) & ~ever
+        return np.isfinite(pool_depths(camera, np.ones(ever.shape, bool), vessel)[0]) & ~ever
+    return _silhouette(vessel, camera) & ~seen_through(_inner_edge(vessel), camera)
+
+
+def look_of_vertices(
+    vessel: FilledVessel, camera: PinholeCamera, vertices: Float[np.ndarray, "v 3"], thickness: float
+) -> VertexLook:
+    """Where the picture shows the look of a vessel and of the ground that it stands on.
+
+    Its walls are thicker than those that are seen, whose outside lies further in: they are read to half of the rim's
+    width, as that is found to a pixel.
+
+    Args:
+        vessel: with its rim, in the camera's world.
+        camera: that sees it.
+        vertices: of ground and walls.
+        thickness: of its walls.
+    """
+    assert vessel.mouth is not None
+    axis, z = np.asarray(vessel.axis), vertices[:, 2]
+    aside = vertices[:, :2] - axis
+    away = np.linalg.norm(aside, axis=1)
+    inside = vessel.radius_at(z)
+    own = (z > vessel.floor + 0.25 * thickness) & (away < inside + 1.5 * thickness)
+    through = np.clip((away - inside) / thickness, 0.0, 1.0) * own
+    seen = min(0.5 * (vessel.mouth.radius - _inner_edge(vessel).radius), thickness)
+    closer = 1.0 - through * (thickness - seen) / np.maximum(away, 1e-9)
+    row, col, _ = camera.nearest_pixels(vertices)
+    before = _silhouette(vessel, camera) | seen_through(vessel.mouth, camera)
+    return VertexLook(np.column_stack([axis + aside * closer[:, None], z]), before[row, col] & ~own, own)
+
+
+def _inner_edge(vessel: FilledVessel) -> VesselRim:
+    assert vessel.mouth is not None
+    return VesselRim(vessel.mouth.center, float(vessel.radius_at(np.array([vessel.rim]))[0]))
+
+
+def _silhouette(vessel: FilledVessel, camera: PinholeCamera) -> Bool[np.ndarray, "h w"]:
+    """Pixels in which a vessel is seen, but for its rim."""
     brimful = replace(vessel, level=vessel.rim, radii=THICK * vessel.radii)
-    opening = VesselRim(vessel.mouth.center, float(vessel.radius_at(np.array([vessel.rim]))[0]))
-    return np.isfinite(pool_depths(camera, whole, brimful)[0]) & ~seen_through(opening, camera)
+    return np.isfinite(pool_depths(camera, np.ones(camera.size[::-1], bool), brimful)[0])
 
 
 def seen_higher(vessel: FilledVessel, camera: PinholeCamera, ever: Bool[np.ndarray, "h w"]) -> FilledVessel:
@@ -431,22 +471,23 @@ def _longest_run(line: np.ndarray) -> tuple[int, int]:
 
 def in_vessel(rims: Sequence[Ellipse], pool: Bool[np.ndarray, "h w"]) -> bool:
     """Whether a pool lies within a rim and below it."""
-    # of an ellipse the covariance is a quarter of the square of half its axes
-    areas = [4.0 * np.pi * float(np.sqrt(np.linalg.det(rim.covariance))) for rim in rims]
-    return any(
-        rim.share_inside(pool) > IN_VESSEL and pool.sum() < BELOW_ITS_RIM * area
-        for rim, area in zip(rims, areas, strict=True)
-    )
+    return any(rim.share_inside(pool) > IN_VESSEL and _shows_wall(rim, pool) for rim in rims)
+
+
+def _shows_wall(rim: Ellipse, pool: Bool[np.ndarray, "h w"]) -> bool:
+    """Whether a pool leaves enough of a rim's disc to the vessel's wall: the far arc of a lower level lies lower."""
+    disc = rim.pixels(pool.shape)
+    far = disc & (np.arange(len(pool))[:, None] + 0.5 < rim.center[1])
+    above, below = (float((part & ~pool).sum() / max(part.sum(), 1)) for part in (far, disc & ~far))
+    return bool((pool & disc).sum() < BELOW_ITS_RIM * disc.sum()) or above > max(FAR_WALL, 2.0 * below)
 
 
 def holds_pool(rim: Ellipse, mask: Bool[np.ndarray, "h w"]) -> bool:
     """Whether a silhouette lies within a rim and below it, but for what comes from above."""
-    inside = rim.share_inside(mask)
     lower = mask & (np.arange(len(mask))[:, None] + 0.5 > rim.center[1])
-    # of an ellipse the covariance is a quarter of the square of half its axes
-    area = 4.0 * np.pi * float(np.sqrt(np.linalg.det(rim.covariance)))
-    below = lower.any() and rim.share_inside(lower) > IN_VESSEL and lower.sum() > MOSTLY * inside * mask.sum()
-    return bool(below and inside * mask.sum() < BELOW_ITS_RIM * area)
+    within = int((mask & rim.pixels(mask.shape)).sum())
+    below = rim.share_inside(lower) > IN_VESSEL and lower.sum() > MOSTLY * within
+    return bool(below and _shows_wall(rim, mask & ~jet_rows(mask)))
 
 
 def fills_a_vessel(rims: Sequence[Ellipse], shown: Bool[np.ndarray, "t h w"], *, pitch: float) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from fluidlift.shape import airborne, channel, generate, ground_mesh, ground_texture, plan, registration
-from fluidlift.shape.filled_vessel import seen_higher
+from fluidlift.shape.filled_vessel import FilledVessel, look_of_vertices, seen_higher
 from fluidlift.shape.jets import lying_pixels
 from fluidlift.types import Label, PinholeCamera, Setting, kind_of
 from fluidlift.types.fluid_masks import parts_of
@@ -86,11 +86,23 @@ def solid_share(labels: np.ndarray) -> np.ndarray:
     return np.sum([part.sum(axis=0) for part in parts], axis=0) / len(labels)
 
 
-def finished(setting: Setting, plate: UInt8[np.ndarray, "h w 3"], camera: PinholeCamera) -> Setting:
-    """The setting in float32, its ground in the colours of the plate where it has no texture."""
-    mesh = setting.terrain.mesh
+def finished(
+    setting: Setting, plate: UInt8[np.ndarray, "h w 3"], camera: PinholeCamera, vessel: FilledVessel | None = None
+) -> Setting:
+    """The setting in float32, its ground in the colours of the plate where it has no texture.
+
+    Args:
+        setting: with its cells.
+        plate: the picture without the fluid, sRGB.
+        camera: in the world.
+        vessel: that stands on the ground, m.
+    """
+    mesh, read = setting.terrain.mesh, None
     if len(mesh.faces) and mesh.texture is None:
-        mesh = replace(mesh, colors=ground_mesh.ground_colours(mesh, plate, camera))
+        if vessel is not None and vessel.mouth is not None:
+            thickness = airborne.WALL * setting.terrain.grid.spacing
+            read = look_of_vertices(vessel, camera, mesh.vertices.astype(np.float64), thickness)
+        mesh = replace(mesh, colors=ground_mesh.ground_colours(mesh, plate, camera, read))
     height = None if setting.surface_height is None else setting.surface_height.astype(np.float32)
     return replace(
         setting, terrain=replace(setting.terrain, mesh=mesh), surface_height=height,

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import cKDTree
 
 from fluidlift.numerics.ground_block import PARTS, ground_mesh
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.types import PinholeCamera, TriangleMesh
 
-__all__ = ["PARTS", "cut_colour", "ground_colours", "ground_mesh"]
+__all__ = ["PARTS", "VertexLook", "cut_colour", "ground_colours", "ground_mesh"]
 
 LOAM = np.array([0.28, 0.24, 0.20])
 """linear reflectance of dry loam, about a quarter"""
@@ -25,8 +27,23 @@ def cut_colour(ground: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
     return srgb_from_linear(OWN * linear_from_srgb(np.median(ground, axis=0)) + (1.0 - OWN) * LOAM)
 
 
+@dataclass(frozen=True)
+class VertexLook:
+    """Where a picture shows the look of a ground's vertices."""
+
+    places: Float[np.ndarray, "v 3"]
+    """at which it is read, m"""
+    covered: Bool[np.ndarray, " v"]
+    """what stands before them is seen in their place"""
+    stands: Bool[np.ndarray, " v"]
+    """they are of what stands on the ground, which lends it no look"""
+
+
 def ground_colours(
-    mesh: TriangleMesh, plate: UInt8[np.ndarray, "h w 3"], camera: PinholeCamera
+    mesh: TriangleMesh,
+    plate: UInt8[np.ndarray, "h w 3"],
+    camera: PinholeCamera,
+    read: VertexLook | None = None,
 ) -> Float[np.ndarray, "v 3"]:
     """sRGB in [0, 1] of each vertex of a terrain.
 
@@ -37,21 +54,25 @@ def ground_colours(
         mesh: of the terrain, world.
         plate: the scene without its fluid.
         camera: in the world.
+        read: where the picture shows the look of each vertex; None: it shows each in its place.
     """
     vertices = mesh.vertices.astype(np.float64)
-    uv, depth = camera.project(vertices)
-    row, col, _ = camera.nearest_pixels(vertices)
+    nothing = np.zeros(len(vertices), bool)
+    read = VertexLook(vertices, nothing, nothing) if read is None else read
+    uv, depth = camera.project(read.places)
+    row, col, _ = camera.nearest_pixels(read.places)
     colours = plate[row, col].astype(np.float32) / 255.0
-    seen = (depth > 0) & (uv >= 0).all(axis=-1) & (uv < np.array(camera.size)).all(axis=-1)
+    seen = (depth > 0) & (uv >= 0).all(axis=-1) & (uv < np.array(camera.size)).all(axis=-1) & ~read.covered
     cut = _cut_vertices(mesh)
     known = seen & ~cut
     if not known.any():
         return colours
     colours[cut] = cut_colour(colours[known])
     hidden = ~seen & ~cut
+    lies = known & ~read.stands if (known & ~read.stands).any() else known
     if hidden.any():
-        nearest = cKDTree(vertices[known, :2]).query(vertices[hidden, :2], k=min(32, int(known.sum())))[1]
-        colours[hidden] = colours[known][nearest.reshape(int(hidden.sum()), -1)].mean(axis=1)
+        nearest = cKDTree(vertices[lies, :2]).query(vertices[hidden, :2], k=min(32, int(lies.sum())))[1]
+        colours[hidden] = colours[lies][nearest.reshape(int(hidden.sum()), -1)].mean(axis=1)
     return colours
 
 

@@ -94,7 +94,7 @@ def level_below(
         radius_at: of the inside at heights z; None: it is read from the silhouette as well.
     """
     center, eye = np.asarray(rim.center), camera.position
-    within = seen_through(rim, camera) & ~_jet(mask)
+    within = seen_through(rim, camera) & ~jet_rows(mask)
     wet = mask[within]
     if not wet.any():
         return None
@@ -113,7 +113,7 @@ def level_below(
     return found
 
 
-def _jet(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def jet_rows(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Pixels of a silhouette's narrow rows above its widest one."""
     width = mask.sum(axis=1)
     narrow = width < JET * float(np.percentile(width[width > 0], 95)) if width.any() else width < 0

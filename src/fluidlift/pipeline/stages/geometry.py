@@ -79,7 +79,8 @@ def geometry(
             "check the mask and --kind, or raise --set shape.cells=...",
         )  # fmt: skip
     bed = bed_of(clip, fluid, seen, setting, camera, depth)
-    setting, picture = _coloured(setting, clip, fluid, seen, falling.pixels, camera, bed)
+    vessel = None if front.vessel is None else front.vessel.transformed(to_world)
+    setting, picture = _coloured(setting, clip, fluid, seen, falling.pixels, camera, bed, vessel)
     return Geometry(
         kind=kind.name,
         kind_source="evidence" if seen.kind_free else "user",
@@ -99,7 +100,7 @@ def geometry(
         plate=picture,
         rest_frame=seen.start,
         united_frames=seen.united,
-        rocks=_solid_before(s, fluid, camera, to_world),
+        rocks=_solid_before(s, fluid, camera, vessel),
         hidden=hidden,
         known_scale=s.known_scale,
         depth_source=None if seen_depth is None else seen_depth.meta,
@@ -186,10 +187,11 @@ def _coloured(
     falls: np.ndarray,
     camera: PinholeCamera,
     bed: BedPicture | None = None,
+    vessel: filled_vessel.FilledVessel | None = None,
 ) -> tuple[Setting, np.ndarray]:
     """The setting with its ground as the clip shows it, and the picture without the fluid, u8 [h,w,3].
 
-    bed: what is seen of it through the water.
+    bed: what is seen of it through the water. vessel: that stands on it, in the world.
     """
     # the plate looks at a few frames only
     solid = ground.solid_share(fluid.labels) > 0.5
@@ -210,7 +212,7 @@ def _coloured(
         view = ground_texture.GroundView(shown, camera, labels, known, under)
         setting = ground.textured(setting, view)
         picture = ground_texture.over_bed(picture, plate.kept, setting.terrain.mesh, camera)
-    setting = ground.finished(setting, picture, camera)
+    setting = ground.finished(setting, picture, camera, vessel)
     if fluid.hidden is not None:  # what stands before the fluid is on no ground, but in the picture without the fluid
         typical = typical_picture(clip.frames, most=8).astype(np.uint8)
         picture = np.where(fluid.hidden[..., None], typical, picture)
@@ -226,13 +228,15 @@ def _hidden(seen: Sight, segmentation: Segmentation) -> np.ndarray | None:
     return found if found.any() else None
 
 
-def _solid_before(s: Sighted, fluid: FluidMasks, camera: PinholeCamera, to_world: Similarity3) -> np.ndarray | None:
+def _solid_before(
+    s: Sighted, fluid: FluidMasks, camera: PinholeCamera, vessel: filled_vessel.FilledVessel | None
+) -> np.ndarray | None:
     """Pixels in which something solid stands in or before the fluid; None: those of the labels."""
     if s.seen.stood is not None:
         return s.seen.stood.solid
-    if s.front.vessel is None or not s.front.vessel.looked_into:
+    if vessel is None or not vessel.looked_into:
         return None
-    walls = filled_vessel.behind_its_wall(s.front.vessel.transformed(to_world), camera, fluid.any_frame())
+    walls = filled_vessel.behind_its_wall(vessel, camera, fluid.any_frame())
     return walls | (ground.solid_share(fluid.labels) > 0.5)
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy import ndimage
 
 from fluidlift.shape import depth_surface, surface
 from fluidlift.shape.filled_vessel import distance_ahead, find_vessel, pool_depths
 from fluidlift.shape.kinds.base import Observation
+from fluidlift.shape.looked_into import jet_rows
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.types.kind import POUR
 
@@ -62,6 +64,10 @@ def _with_pool(front: FrontSurface, seen: Observation) -> FrontSurface:
     near, far = pool_depths(camera, mask, vessel)
     held = np.isfinite(near)
     depth, half = np.where(held, near, front.depth), np.where(held, 0.5 * (far - near), front.half_thickness)
+    if vessel.mouth is not None and held.any():  # waves and drops at its edge lie on it, and not as far away as the jet
+        edge = mask & ~held & ~jet_rows(mask)
+        nearest = ndimage.distance_transform_edt(~held, return_distances=False, return_indices=True)
+        depth, half = (np.where(edge, values[tuple(nearest)], values) for values in (depth, half))
     return replace(front, depth=depth.astype(np.float32), half_thickness=half.astype(np.float32), vessel=vessel)
 
 

@@ -80,12 +80,20 @@ class Ellipse:
         linear = -shape @ c
         return np.block([[shape, linear[:, None]], [linear[None], np.array([[c @ shape @ c - 1.0]])]])
 
+    def encloses(self, points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+        """Which points (u, v) lie within it."""
+        offset = points - self.center
+        return np.einsum("ni,ij,nj->n", offset, np.linalg.inv(self.covariance), offset) <= 4.0
+
+    def pixels(self, shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
+        """Those of a picture that it encloses."""
+        grid = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), -1) + 0.5
+        return self.encloses(grid.reshape(-1, 2)).reshape(shape[0], shape[1])
+
     def share_inside(self, region: Bool[np.ndarray, "h w"]) -> float:
         """Share of a region's pixels that it encloses."""
         rows, cols = np.nonzero(region)
-        offset = np.stack([cols + 0.5, rows + 0.5], -1) - self.center
-        radius = np.einsum("ni,ij,nj->n", offset, np.linalg.inv(self.covariance), offset)
-        return float((radius <= 4.0).mean()) if len(rows) else 0.0
+        return float(self.encloses(np.stack([cols, rows], -1) + 0.5).mean()) if len(rows) else 0.0
 
 
 def fit_ellipse(region: Bool[np.ndarray, "h w"]) -> Ellipse | None:

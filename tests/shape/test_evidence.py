@@ -1,10 +1,16 @@
 """Change is measured in units of the noise, and what advances is told from what stays."""
 
-import numpy as np
+from itertools import pairwise
 
-from fluidlift.shape.evidence import noise_map, separating_level
+import cv2
+import numpy as np
+import pytest
+
+from fluidlift.motion.optical_flow import DenseInverseSearch, flow_of_pair
+from fluidlift.shape.evidence import gather_evidence, noise_map, separating_level
 from fluidlift.shape.presence import Presence, grows
 from fluidlift.shape.region import solids_in
+from fluidlift.types.clip import VideoClip
 
 
 def test_two_populations_are_divided_between_them_and_one_is_not_divided_below_the_floor():
@@ -55,3 +61,24 @@ def test_small_holes_are_filled_still_ones_are_solid_and_open_bays_stay_outside(
     assert solid.sum() == 100 and solid[20:30, 20:30].all()
     assert filled[40, 40] and not filled[12, 47] and not solid[12, 47]
     assert solids_in(region, ~still)[0][25, 25], "a hole that moves is fluid"
+
+
+def test_a_current_streams_at_every_frame_rate():
+    """A band of a pattern that goes 24 px a second before a still one: 1 px or 0.2 between two frames."""
+    rng = np.random.default_rng(0)
+    patterns = [cv2.GaussianBlur(rng.normal(size=(72, 360)).astype(np.float32), (0, 0), 2.5) for _ in range(2)]
+    moving, still = (128.0 + 8.0 * pattern / pattern.std() for pattern in patterns)
+    inside = np.zeros((72, 120), bool)
+    inside[18:54] = True
+    found = []
+    for rate in (24, 120):
+        frames = []
+        for t in range(rate):
+            shift = np.float32([[1.0, 0.0, -24.0 * t / rate - 20.0], [0.0, 1.0, 0.0]])
+            here = cv2.warpAffine(moving, shift, (120, 72), flags=cv2.INTER_CUBIC)
+            grey = np.where(inside, here, still[:, :120]) + rng.normal(scale=1.5, size=inside.shape)
+            frames.append(np.clip(grey, 0, 255).round().astype(np.uint8)[..., None].repeat(3, axis=-1))
+        clip, estimator = VideoClip(np.stack(frames), np.arange(rate) / rate, "made"), DenseInverseSearch()
+        flow = [flow_of_pair(a, b, estimator) for a, b in pairwise(clip.frames)]
+        found.append(float(gather_evidence(clip, flow.__getitem__).streaming[inside].mean()))
+    assert found[0] > 0.3 and found[1] == pytest.approx(found[0], rel=0.35)

@@ -40,6 +40,9 @@ def in_order(flow: PairReader, pairs: Iterable[int]) -> Iterator[tuple[np.ndarra
     return map(flow, pairs) if ahead is None else ahead(pairs)
 
 
+USUAL_RATE = 30.0
+"""1/s, frame rate of the clips that the numbers here were seen on (24 to 30). Of a clip with twice as many frames or
+more, frames that lie as far apart are compared: from one to the next too little moves to tell it from noise"""
 QUANTISATION = 0.3
 """mean absolute change between two 8-bit readings of the same brightness, grey levels: a floor for the noise"""
 QUIET_QUANTILE = 0.2
@@ -184,9 +187,9 @@ def change_over_time(evidence: Evidence) -> Iterator[np.ndarray]:
 
 
 def flow_evidence(
-    source: FramePictures, flow: PairReader, scale: float, noise: np.ndarray
+    source: FramePictures, flow: PairReader, scale: float, noise: np.ndarray, lag: int = 1
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Swaying, streaming and being carried, each float32 [h,w] in [0,1], over the sampled frames.
+    """Swaying, streaming and being carried, each float32 [h,w] in [0,1], over the sampled frames, `lag` apart.
 
     A leaf moves to and fro: its flow explains the change of brightness well (small residual after warping) but sums
     to nearly nothing. A stream either goes somewhere (large sum) or changes in ways that no motion explains. A hand, a
@@ -200,11 +203,15 @@ def flow_evidence(
     farthest, path = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
     before, after = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
     total, squares = np.zeros((height, width, 2), np.float32), np.zeros((height, width), np.float32)
-    pairs = source.pairs(1)
-    flows = in_order(flow, [int(source.sampled[one]) for one, _ in pairs])
-    for (one, other), (displacement, confidence) in zip(pairs, flows, strict=True):
-        sure = shrink(np.asarray(confidence, np.float32), scale)[..., None]
-        step = shrink(np.nan_to_num(np.asarray(displacement, np.float32)), scale) * scale
+    pairs = source.pairs(lag)
+    pairs = pairs[source.sampled[pairs[:, 0]] % lag == 0]
+    flows = in_order(flow, [int(source.sampled[one]) + k for one, _ in pairs for k in range(lag)])
+    for one, other in pairs:
+        # what a place sees in all of these frames: it moves by less than it is pooled over
+        steps = [next(flows) for _ in range(lag)]
+        displacement = sum(np.nan_to_num(np.asarray(d, np.float32)) for d, _ in steps)
+        confidence = np.min([np.asarray(c, np.float32) for _, c in steps], axis=0)
+        sure, step = shrink(confidence, scale)[..., None], shrink(displacement, scale) * scale
         first, second = source.kept[one].astype(np.float32), source.kept[other].astype(np.float32)
         warped = cv2.remap(
             second, columns + step[..., 0], rows + step[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -240,12 +247,13 @@ def gather_evidence(clip: VideoClip, flow: PixelFlow | PairReader) -> Evidence:
     steep = sharpness(source.typical)
     longest = max(1, burst_length(frames, clip.interval) // 3)
     slow_lag = int(np.clip(round(0.2 / clip.interval), 1, longest))
-    quick, slow = lagged_change(pictures, source.pairs(1)), lagged_change(pictures, source.pairs(slow_lag))
+    lag = int(np.clip(round(1.0 / (USUAL_RATE * clip.interval)), 1, slow_lag))
+    quick, slow = lagged_change(pictures, source.pairs(lag)), lagged_change(pictures, source.pairs(slow_lag))
     noise, slow_noise = noise_map(quick, steep), noise_map(slow, steep)
     fine = 0.5 * (np.log(np.maximum(quick, 1e-3) / noise) + np.log(np.maximum(slow, 1e-3) / slow_noise))
     fine = np.maximum(fine, 0.0).astype(np.float32)
     pooled = pool(fine, POOLING * max(noise.shape))
-    swaying, streaming, carried = flow_evidence(source, pair, scale, noise)
+    swaying, streaming, carried = flow_evidence(source, pair, scale, noise, lag)
     energy = [float(change_between(pictures[i], pictures[j], noise).mean()) for i, j in source.pairs(1)]
     return Evidence(
         source=source,

@@ -32,6 +32,8 @@ from fluidlift.types import (
     Grid,
     PinholeCamera,
     SurfaceMotion,
+    Terrain,
+    TriangleMesh,
     UpEvidence,
     kind_of,
 )
@@ -183,7 +185,9 @@ def test_a_new_kind_is_one_registration(mist):
     assert (up.pitch, up.source) == (12.0, "usual view of a mist")
     assert layer_thickness("mist", 0.1) == pytest.approx(0.03)
     assert sticking("mist", []) == pytest.approx(0.01)
-    assert glass_of("mist") is None
+    nothing = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int))
+    air = Terrain(Grid((1, 1, 1), 1.0), np.ones((2, 2, 2), np.float32), np.array([1.0, 0.0, 0.0]), nothing)
+    assert glass_of("mist", air) is None and glass_of("pour", air) is not None
     keys = [c.key for c in controls_of(FluidParameters(), "mist")]
     assert keys == [c.key for c in controls_of(FluidParameters(), "plume")]
     points = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3))

@@ -209,7 +209,7 @@ def flow_evidence(
     for one, other in pairs:
         # what a place sees in all of these frames: it moves by less than it is pooled over
         steps = [next(flows) for _ in range(lag)]
-        displacement = sum(np.nan_to_num(np.asarray(d, np.float32)) for d, _ in steps)
+        displacement = np.sum([np.nan_to_num(np.asarray(d, np.float32)) for d, _ in steps], axis=0)
         confidence = np.min([np.asarray(c, np.float32) for _, c in steps], axis=0)
         sure, step = shrink(confidence, scale)[..., None], shrink(displacement, scale) * scale
         first, second = source.kept[one].astype(np.float32), source.kept[other].astype(np.float32)

@@ -150,7 +150,7 @@ def glass(rises):
     clip = VideoClip(np.zeros((times, SIDE, SIDE, 3), np.uint8), INTERVAL * np.arange(times), "made")
     flat = np.full((SIDE, SIDE), away, np.float32)
     geometry = SimpleNamespace(
-        kind="pour", setting=SimpleNamespace(pool_level=-0.1), camera=camera, mask=labels[0] == Label.FLUID,
+        kind="pour", setting=SimpleNamespace(pool_level=-0.1, rim=None), camera=camera, mask=labels[0] == Label.FLUID,
         depth=flat, half_thickness=np.zeros_like(flat), rest_frame=0,
     )  # fmt: skip
     return SimpleNamespace(clip=clip), FluidMasks(labels), geometry

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fluidlift.shape.channel import ChannelConfig, channel_setting
 from fluidlift.shape.filled_vessel import (
     FilledVessel,
     behind_its_wall,
@@ -16,10 +17,12 @@ from fluidlift.shape.filled_vessel import (
     seen_higher,
 )
 from fluidlift.shape.ground_mesh import VertexLook, ground_colours
+from fluidlift.shape.heights import PlaneHeight
 from fluidlift.shape.kind import level_camera
-from fluidlift.shape.looked_into import level_below, rim_circle, seen_through
+from fluidlift.shape.looked_into import bowl_of, level_below, rim_circle, seen_through
+from fluidlift.shape.plan import PlanEvidence
 from fluidlift.shape.view.roundness import Ellipse, fit_ellipse
-from fluidlift.types import PinholeCamera, Similarity3, TriangleMesh, UpEvidence, VesselRim
+from fluidlift.types import CellType, Label, PinholeCamera, Similarity3, TriangleMesh, UpEvidence, VesselRim
 
 AWAY, RADIUS, TAPER = 2.0, 0.25, 0.3
 """m to the axis along the ground, of the rim's inner edge, and radius lost per height"""
@@ -170,3 +173,50 @@ def test_ground_that_a_vessel_hides_goes_on_as_the_ground_beside_it():
     found = ground_colours(mesh, plate, camera, VertexLook(vertices, covered, stands))
     assert found[4].max() < 0.25 and found[9].min() > 0.9
     np.testing.assert_array_equal(np.delete(found, 4, axis=0), np.delete(plain, 4, axis=0))
+
+
+@pytest.mark.parametrize("level", [0.08, 0.2])
+def test_a_rim_above_standing_water_tells_the_bowl_that_it_stands_in(level):
+    camera, truth = camera_at(35.0), cup(level)
+    assert truth.mouth is not None
+    mask = shown(camera, truth, jet=0.0)
+    found = bowl_of(camera, ellipse_of(camera, truth.mouth), mask, truth.level)
+    assert found is not None
+    assert found.rim.center == pytest.approx(truth.mouth.center, abs=4.0 * PIXEL)
+    assert found.rim.radius == pytest.approx(RADIUS, rel=0.06)
+    hidden = np.isfinite(pool_depths(camera, np.ones_like(mask), truth)[0]) & ~mask
+    pool = found.pool(camera)
+    assert pool[mask].mean() > 0.95 and pool[hidden & pool_of(camera, truth)].mean() > 0.9
+    assert bowl_of(camera, ellipse_of(camera, truth.mouth), np.zeros_like(mask), truth.level) is None
+
+
+def pool_of(camera: PinholeCamera, vessel: FilledVessel) -> np.ndarray:
+    """Pixels of all of its level."""
+    assert vessel.mouth is not None
+    level = VesselRim((*vessel.axis, vessel.level), float(vessel.radius_at(np.array([vessel.level]))[0]))
+    return seen_through(level, camera)
+
+
+def test_the_ground_around_standing_water_is_its_bowl_on_a_table():
+    camera, truth = camera_at(35.0), cup(0.1)
+    assert truth.mouth is not None
+    mask = shown(camera, truth, jet=0.0)
+    bowl = bowl_of(camera, ellipse_of(camera, truth.mouth), mask, truth.level)
+    assert bowl is not None
+    pool = bowl.pool(camera)
+    labels = np.where(pool, np.uint8(Label.FLUID), np.uint8(Label.BACKGROUND))
+    rays = camera.rays(camera.pixel_grid()[pool])
+    visible = camera.position + rays * ((truth.level - camera.position[2]) / rays[:, 2:])
+    surface = PlaneHeight((0.0, 0.0), truth.level)
+    seen = PlanEvidence(
+        surface, labels, visible, camera, np.array([1.0, 0.0, 0.0]), closed=True, goes_on=True, ever=pool, bowl=bowl
+    )
+    setting = channel_setting(seen, ChannelConfig("basin", 48, 200_000))
+    grid, ground = setting.terrain.grid, setting.bed_height
+    away = np.linalg.norm(grid.centers()[:, :, 0, :2] - truth.axis, axis=-1)
+    water = (setting.cell_types == CellType.FLUID).any(axis=2)
+    assert water[away < bowl.level.radius - 1.5 * grid.spacing].all(), "also behind its near wall"
+    ring = (away > bowl.rim.radius + 0.5 * grid.spacing) & (away < bowl.rim.radius + 2.5 * grid.spacing)
+    np.testing.assert_allclose(ground[ring], bowl.rim.center[2], atol=1e-6)
+    table = away > bowl.rim.radius + 5.5 * grid.spacing
+    assert table.any() and np.ptp(ground[table]) < 1e-9 and ground[table].max() < truth.level - 2.0 * grid.spacing

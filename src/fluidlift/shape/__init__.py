@@ -36,6 +36,8 @@ Modules of the face:
     kind              What kind of fluid a clip shows, and where up is: decided from evidence that the report can
                       show
     kinds             How the body of each kind of fluid is built: one file per kind, found by its name
+    looked_into       What a rim says of a vessel that is looked into: where it stands, how wide it is, and how high
+                      the liquid in it is
     occluders         What stands before a fall and hides it (a plant, a post, a parapet), told from ground by what
                       the water does there
     off_picture       Extrapolation of a stream's surface beyond the edges of the picture: the seen one goes on as
@@ -94,6 +96,7 @@ __all__ = [
     "jet_column",
     "kind",
     "kinds",
+    "looked_into",
     "occluders",
     "off_picture",
     "prune",

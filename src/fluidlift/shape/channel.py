@@ -13,6 +13,7 @@ from fluidlift.shape import cross_section
 from fluidlift.shape.cross_section import distance_inside
 from fluidlift.shape.depth_surface import solid_heights
 from fluidlift.shape.ground_mesh import ground_mesh
+from fluidlift.shape.looked_into import Bowl
 from fluidlift.shape.plan import Extent, Plan, PlanEvidence, dry_columns, extent_of, plan_of, wide_ends, with_seen
 from fluidlift.shape.terrain import at_cells, signed_distance_from, to_corners, unit
 from fluidlift.types import CellType, FluidKind, Grid, Label, PinholeCamera, Setting, Terrain, kind_of, triple
@@ -39,6 +40,15 @@ BEYOND = 0.25
 """cells from the rim of the wet columns to the wall beside them: none was thinner than the stream, whole ones wider"""
 MARGIN = 2.0
 """cells by which such a wall stands above the water: waves of a stream of some four cells' depth stay below"""
+
+
+LIP, SIDE = 3.0, 2.0
+"""cells, width of the rim of a vessel, and of its side seen from above: narrower ones are ragged on their way between
+columns"""
+
+
+TABLE = 1.2
+"""radii of its rim that the box around a vessel goes to, beside four cells: the side of the vessel, and some table"""
 
 
 @dataclass(frozen=True)
@@ -95,8 +105,13 @@ def channel_setting(seen: PlanEvidence, config: ChannelConfig) -> Setting:
         depth = max(depth, SHALLOWEST * float((extent.high - extent.low).max()) / config.longest)
     spacing = max((extent.high - extent.low).max() / config.longest, depth / 10)
     spacing = min(spacing, depth / 4)  # fewer than four cells hold no velocity profile
+    low, high = extent.low.copy(), extent.high.copy()
+    if seen.bowl is not None:
+        center, reach = np.asarray(seen.bowl.rim.center), TABLE * seen.bowl.rim.radius
+        low[:2], high[:2] = np.minimum(low, center - reach)[:2], np.maximum(high, center + reach)[:2]
+        high[2] = max(high[2], center[2])
     for _ in range(60):
-        grid = _channel_grid(seen.surface, extent.low, extent.high, depth, spacing)
+        grid = _channel_grid(seen.surface, low, high, depth, spacing)
         if grid.cells <= config.cell_limit:
             break
         spacing *= 1.05
@@ -114,7 +129,18 @@ def channel_setting(seen: PlanEvidence, config: ChannelConfig) -> Setting:
     ground = _bed_and_banks(plan, grid, (depth, thin), extent, kind, rim, beach=beach)
     shown = np.minimum(ground.shown, np.maximum(_sight_lines(plan, grid, seen.camera), plan.level + LOWEST * spacing))
     ground = _as_seen(_Ground(shown, shown, ground.water), plan, grid, seen, extent)
+    if seen.bowl is not None:
+        ground = _within_bowl(ground, grid, seen.bowl)
     return _fill_channel(grid, plan, ground, extent.reach, seen, kind)
+
+
+def _within_bowl(ground: _Ground, grid: Grid, bowl: Bowl) -> _Ground:
+    """The ground beside the water as wall and rim of the vessel that it stands in, and around that a table as low as
+    the bed."""
+    h, table = grid.spacing, float(ground.shown[ground.water].min(initial=np.inf))
+    around = bowl.height(grid.centers()[:, :, 0, :2], LIP * h, SIDE * h, table if np.isfinite(table) else bowl.level.z)
+    shown = np.where(ground.water, ground.shown, around)
+    return _Ground(shown, shown, ground.water)
 
 
 def _channel_grid(surface, low, high, depth, spacing) -> Grid:

@@ -31,11 +31,16 @@ def setting_around(
     *,
     in_metres=False,
     pool=None,
+    bowl=None,
     **known,
 ) -> Setting:
     """Terrain and cells around a surface, whose size is known `in_metres` or assumed; `pool`, pixels that lie
-    whether they are seen to or not; what is known beside it goes to
+    whether they are seen to or not; `bowl`, in which it stands; what is known beside it goes to
     `plan.PlanEvidence`."""
+    ever = fluid.any_frame()
+    if bowl is not None:  # its near wall hides water
+        pool = bowl.pool(camera)
+        ever = ever | pool
     mask = generate.united_mask(fluid[start : start + united])
     mask = mask if pool is None else mask | pool
     visible = mask & (depth > 0)
@@ -45,7 +50,7 @@ def setting_around(
         labels = seen_labels(fluid, start, united, falls)
         labels = labels if pool is None else np.where(pool, Label.FLUID, labels).astype(np.uint8)
         height = registration.PlacedHeight(front.height, to_world)
-        seen = plan.PlanEvidence(height, labels, near, camera, bulk, ever=fluid.any_frame(), **known)
+        seen = plan.PlanEvidence(height, labels, near, camera, bulk, ever=ever, bowl=bowl, **known)
         return channel.channel_setting(
             seen, channel.ChannelConfig(kind, c.cells, c.cell_limit, c.depth_ratio, in_metres)
         )

@@ -50,20 +50,74 @@ def rim_circle(camera: PinholeCamera, rim: Ellipse, distance: float) -> VesselRi
         rim: in the picture, px.
         distance: from the camera to the circle's center along the ground.
     """
+    flat = _below_eye(camera, rim)
+    if flat is None or flat[0] == 0.0 == flat[1]:  # straight below, no way along the ground tells how far
+        return None
+    return _scaled(flat, distance / float(np.hypot(*flat[:2])), camera)
+
+
+def _below_eye(camera: PinholeCamera, rim: Ellipse) -> tuple[float, float, float] | None:
+    """x, y from the eye and radius of the circle that an ellipse shows on the level plane one below it; None where it
+    reaches up to the horizon."""
     turn = np.linspace(0.0, 2.0 * np.pi, TURNS, endpoint=False)
     values, axes = np.linalg.eigh(rim.covariance)
     outline = rim.center + 2.0 * (np.stack([np.cos(turn), np.sin(turn)], axis=-1) * np.sqrt(values)) @ axes.T
     rays = camera.rays(outline)
     if (rays[:, 2] > -1e-3).any():
         return None
-    flat = rays[:, :2] / -rays[:, 2:]  # on the plane one below the eye
+    flat = rays[:, :2] / -rays[:, 2:]
     terms = np.column_stack([2.0 * flat, np.ones(TURNS)])
     x, y, rest = np.linalg.lstsq(terms, np.square(flat).sum(axis=1), rcond=None)[0]
-    away, radius = float(np.hypot(x, y)), float(np.sqrt(max(rest + x * x + y * y, 0.0)))
-    if away < 1e-6:  # straight below: no way along the ground tells how far
+    return float(x), float(y), float(np.sqrt(max(rest + x * x + y * y, 0.0)))
+
+
+def _scaled(flat: tuple[float, float, float], scale: float, camera: PinholeCamera) -> VesselRim:
+    center = camera.position + scale * np.array([flat[0], flat[1], -1.0])
+    return VesselRim(triple(center.tolist()), scale * flat[2])
+
+
+@dataclass(frozen=True)
+class Bowl:
+    """A vessel in which a liquid stands: a cone from its level circle up to the inner edge of its rim."""
+
+    rim: VesselRim
+    """its radius is that of the inner edge"""
+    level: Level
+
+    def pool(self, camera: PinholeCamera) -> Bool[np.ndarray, "h w"]:
+        """Pixels of all of its level, with what its near wall hides."""
+        return _away(self.rim, camera, self.level.z) < self.level.radius
+
+    def height(self, xy: Float[np.ndarray, "*n 2"], lip: float, side: float, table: float) -> Float[np.ndarray, "*n"]:
+        """z of wall and rim, which is `lip` wide, beside the level; it falls to a table around it over `side`."""
+        away = np.linalg.norm(xy - np.asarray(self.rim.center[:2]), axis=-1)
+        inner = max(self.rim.radius, 1.001 * self.level.radius)  # upright at most
+        edge = self.rim.center[2]
+        places = [self.level.radius, inner, inner + lip, inner + lip + side]
+        return np.interp(away, places, [self.level.z, edge, edge, table])
+
+
+def bowl_of(camera: PinholeCamera, rim: Ellipse, mask: Bool[np.ndarray, "h w"], z: float) -> Bowl | None:
+    """The vessel in which standing water lies at a height z; None where no rim above it leaves to be seen what is.
+
+    Args:
+        camera: in the world.
+        rim: px.
+        mask: pixels of the water.
+        z: of its level.
+    """
+    flat, best, found, nothing = _below_eye(camera, rim), LIKENESS, None, np.zeros_like(mask)
+    if flat is None:
         return None
-    scale = distance / away
-    return VesselRim(triple(camera.position + scale * np.array([x, y, -1.0])), scale * radius)
+    deep = float(camera.position[2]) - z
+    for above in np.arange(STEP, DEEPEST, STEP) * flat[2] * deep:
+        edge = _scaled(flat, deep - float(above), camera)
+        if deep <= above:
+            break
+        likeness, level = _Opening.of(edge, camera, mask, ~nothing).fit(z)
+        if level is not None and likeness > best:
+            best, found = likeness, Bowl(VesselRim(edge.center, level.inner), level)
+    return found
 
 
 def at_height(camera: PinholeCamera, z: float) -> Float[np.ndarray, "h w 2"]:
@@ -76,7 +130,12 @@ def at_height(camera: PinholeCamera, z: float) -> Float[np.ndarray, "h w 2"]:
 
 def seen_through(rim: VesselRim, camera: PinholeCamera) -> Bool[np.ndarray, "h w"]:
     """Pixels that look through a rim."""
-    return np.hypot(*np.moveaxis(at_height(camera, rim.center[2]) - rim.center[:2], -1, 0)) < rim.radius
+    return _away(rim, camera, rim.center[2]) < rim.radius
+
+
+def _away(rim: VesselRim, camera: PinholeCamera, z: float) -> Float[np.ndarray, "h w"]:
+    """Distance from a rim's axis at which the ray of each pixel meets a level plane; inf where it does not."""
+    return np.hypot(*np.moveaxis(at_height(camera, z) - rim.center[:2], -1, 0))
 
 
 def level_below(
@@ -93,24 +152,48 @@ def level_below(
         mask: fluid pixels, with the jet that falls in.
         radius_at: of the inside at heights z; None: it is read from the silhouette as well.
     """
-    center, eye = np.asarray(rim.center), camera.position
-    within = seen_through(rim, camera) & ~jet_rows(mask)
-    wet = mask[within]
-    if not wet.any():
-        return None
-    there = at_height(camera, center[2])[within]
-    at_rim, flat = np.hypot(*(there - center[:2]).T) / rim.radius, (there - eye[:2]) / (eye[2] - center[2])
-    best, found = LIKENESS, None
+    opening, best, found = _Opening.of(rim, camera, mask & ~jet_rows(mask), ~jet_rows(mask)), LIKENESS, None
     for below in np.arange(0.0, DEEPEST, STEP):
-        z = center[2] - below * rim.radius
-        away = np.hypot(*(eye[:2] + (eye[2] - z) * flat - center[:2]).T)
-        tried = None if radius_at is None else float(radius_at(np.array([z]))[0])
-        for inner in INNER:
-            open_ = at_rim < inner
-            likeness, radius = _best_circle(away[open_], wet[open_], int(wet.sum()), rim.radius, tried)
-            if likeness > best:
-                best, found = likeness, Level(float(z), min(radius, inner * rim.radius), inner * rim.radius)
+        z = float(rim.center[2] - below * rim.radius)
+        likeness, level = opening.fit(z, None if radius_at is None else float(radius_at(np.array([z]))[0]))
+        if likeness > best:
+            best, found = likeness, level
     return found
+
+
+@dataclass(frozen=True)
+class _Opening:
+    """What is seen through a rim; n pixels."""
+
+    rim: VesselRim
+    eye: np.ndarray
+    at_rim: Float[np.ndarray, " n"]
+    """distance from the axis at the rim's height, in its radii"""
+    flat: Float[np.ndarray, "n 2"]
+    """way along the ground per height of each ray"""
+    wet: Bool[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, rim: VesselRim, camera: PinholeCamera, mask: np.ndarray, judged: np.ndarray) -> _Opening:
+        """Of the judged pixels, of which those of a mask are wet."""
+        center, eye = np.asarray(rim.center), camera.position
+        within = seen_through(rim, camera) & judged
+        there = at_height(camera, center[2])[within]
+        away = np.hypot(*(there - center[:2]).T) / rim.radius
+        return cls(rim, eye, away, (there - eye[:2]) / (eye[2] - center[2]), mask[within])
+
+    def fit(self, z: float, radius: float | None = None) -> tuple[float, Level | None]:
+        """IoU of what is wet with the level circle at a height that fits it best, of a radius where that is given."""
+        if not self.wet.any():
+            return 0.0, None
+        away = np.hypot(*(self.eye[:2] + (self.eye[2] - z) * self.flat - self.rim.center[:2]).T)
+        best, found = 0.0, None
+        for inner in INNER:
+            seen, most = self.at_rim < inner, inner * self.rim.radius
+            likeness, fits = _best_circle(away[seen], self.wet[seen], int(self.wet.sum()), self.rim.radius, radius)
+            if likeness > best:
+                best, found = likeness, Level(z, min(fits, most), most)
+        return best, found
 
 
 def jet_rows(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

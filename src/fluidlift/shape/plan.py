@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from fluidlift.errors import require, required
 from fluidlift.shape.cross_section import distance_inside
 from fluidlift.shape.heights import HeightModel
+from fluidlift.shape.looked_into import Bowl
 from fluidlift.types import Grid, Label, PinholeCamera
 
 COARSE = 96
@@ -56,6 +57,8 @@ class PlanEvidence:
     horizon: tuple[tuple[float, float], tuple[float, float]] | None = None
     """px (u, v), where it crosses the left and the right edge of the picture, or beyond; None: not known. A camera that
     was raised for a relief looks down on a plane there and above, where the picture shows the sky"""
+    bowl: Bowl | None = None
+    """in which it stands, where a rim shows that"""
 
     @cached_property
     def reaches_horizon(self) -> bool:

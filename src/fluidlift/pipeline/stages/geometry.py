@@ -26,6 +26,7 @@ from fluidlift.shape import (
 from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.kinds import builder_of
+from fluidlift.shape.looked_into import Bowl, bowl_of
 from fluidlift.shape.view import horizon_line
 from fluidlift.types import (
     CellType,
@@ -152,9 +153,20 @@ def _setting(
         speed=speed, scene_depth=scene, in_metres=s.scale.source != "assumed",
         closed=parts.puddle or kind.is_standing_water, goes_on=kind.is_standing_water,
         pool=parts.lying if kind.rises_from_pool else None, horizon=_horizon(s, camera),
+        bowl=_bowl(s, camera, to_world),
     )  # fmt: skip
     lies = ~s.falling.pixels[s.visible]
     return composite.composed(setting, s.falling, to_world, s.points[lies], s.velocities[lies], camera)
+
+
+def _bowl(s: Sighted, camera: PinholeCamera, to_world: Similarity3) -> Bowl | None:
+    """The vessel in which standing water lies, by its rim."""
+    seen = s.seen
+    if not seen.kind.is_standing_water or not len(s.points):
+        return None
+    held = next((rim for rim in seen.heeded_rims if filled_vessel.in_vessel([rim], seen.mask)), None)
+    level = float(np.median(to_world.points(s.points)[:, 2]))
+    return None if held is None else bowl_of(camera, held, seen.mask, level)
 
 
 def _horizon(s: Sighted, camera: PinholeCamera) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -106,26 +106,27 @@ def bowl_of(camera: PinholeCamera, rim: Ellipse, mask: Bool[np.ndarray, "h w"], 
         mask: pixels of the water.
         z: of its level.
     """
-    flat, best, found, nothing = _below_eye(camera, rim), LIKENESS, None, np.zeros_like(mask)
+    flat, best, found = _below_eye(camera, rim), LIKENESS, None
     if flat is None:
         return None
+    within = rim.pixels(mask.shape)
+    ways, wet = _ways_down(camera)[within], mask[within]
     deep = float(camera.position[2]) - z
     for above in np.arange(STEP, DEEPEST, STEP) * flat[2] * deep:
         edge = _scaled(flat, deep - float(above), camera)
         if deep <= above:
             break
-        likeness, level = _Opening.of(edge, camera, mask, ~nothing).fit(z)
+        likeness, level = _Opening.of(edge, camera, ways, wet).fit(z)
         if level is not None and likeness > best:
             best, found = likeness, Bowl(VesselRim(edge.center, level.inner), level)
     return found
 
 
-def at_height(camera: PinholeCamera, z: float) -> Float[np.ndarray, "h w 2"]:
-    """x, y at which the ray of each pixel meets a level plane below the camera; inf where it looks up."""
+def _ways_down(camera: PinholeCamera) -> Float[np.ndarray, "h w 2"]:
+    """Way along the ground per height of the ray of each pixel; inf where it looks up."""
     rays = camera.rays(camera.pixel_grid())
     down = rays[..., 2] < -1e-6
-    flat = rays[..., :2] / np.where(down, -rays[..., 2], 1.0)[..., None]
-    return np.where(down[..., None], camera.position[:2] + (camera.position[2] - z) * flat, np.inf)
+    return np.where(down[..., None], rays[..., :2] / np.where(down, -rays[..., 2], 1.0)[..., None], np.inf)
 
 
 def seen_through(rim: VesselRim, camera: PinholeCamera) -> Bool[np.ndarray, "h w"]:
@@ -135,7 +136,8 @@ def seen_through(rim: VesselRim, camera: PinholeCamera) -> Bool[np.ndarray, "h w
 
 def _away(rim: VesselRim, camera: PinholeCamera, z: float) -> Float[np.ndarray, "h w"]:
     """Distance from a rim's axis at which the ray of each pixel meets a level plane; inf where it does not."""
-    return np.hypot(*np.moveaxis(at_height(camera, z) - rim.center[:2], -1, 0))
+    met = camera.position[:2] + (camera.position[2] - z) * _ways_down(camera)
+    return np.hypot(*np.moveaxis(met - rim.center[:2], -1, 0))
 
 
 def level_below(
@@ -152,7 +154,8 @@ def level_below(
         mask: fluid pixels, with the jet that falls in.
         radius_at: of the inside at heights z; None: it is read from the silhouette as well.
     """
-    opening, best, found = _Opening.of(rim, camera, mask & ~jet_rows(mask), ~jet_rows(mask)), LIKENESS, None
+    judged = seen_through(rim, camera) & ~jet_rows(mask)
+    opening, best, found = _Opening.of(rim, camera, _ways_down(camera)[judged], mask[judged]), LIKENESS, None
     for below in np.arange(0.0, DEEPEST, STEP):
         z = float(rim.center[2] - below * rim.radius)
         likeness, level = opening.fit(z, None if radius_at is None else float(radius_at(np.array([z]))[0]))
@@ -174,13 +177,11 @@ class _Opening:
     wet: Bool[np.ndarray, " n"]
 
     @classmethod
-    def of(cls, rim: VesselRim, camera: PinholeCamera, mask: np.ndarray, judged: np.ndarray) -> _Opening:
-        """Of the judged pixels, of which those of a mask are wet."""
+    def of(cls, rim: VesselRim, camera: PinholeCamera, flat: np.ndarray, wet: np.ndarray) -> _Opening:
+        """Of pixels within the rim, with their ways down."""
         center, eye = np.asarray(rim.center), camera.position
-        within = seen_through(rim, camera) & judged
-        there = at_height(camera, center[2])[within]
-        away = np.hypot(*(there - center[:2]).T) / rim.radius
-        return cls(rim, eye, away, (there - eye[:2]) / (eye[2] - center[2]), mask[within])
+        away = np.hypot(*(eye[:2] + (eye[2] - center[2]) * flat - center[:2]).T) / rim.radius
+        return cls(rim, eye, away, flat, wet)
 
     def fit(self, z: float, radius: float | None = None) -> tuple[float, Level | None]:
         """IoU of what is wet with the level circle at a height that fits it best, of a radius where that is given."""

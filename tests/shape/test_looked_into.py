@@ -188,6 +188,8 @@ def test_a_rim_above_standing_water_tells_the_bowl_that_it_stands_in(level):
     pool = found.pool(camera)
     assert pool[mask].mean() > 0.95 and pool[hidden & pool_of(camera, truth)].mean() > 0.9
     assert bowl_of(camera, ellipse_of(camera, truth.mouth), np.zeros_like(mask), truth.level) is None
+    beyond = mask | np.roll(mask, 20, axis=1)
+    assert bowl_of(camera, ellipse_of(camera, truth.mouth), beyond, truth.level) is None, "another bank holds that"
 
 
 def pool_of(camera: PinholeCamera, vessel: FilledVessel) -> np.ndarray:

@@ -13,7 +13,7 @@ from fluidlift.shape import cross_section
 from fluidlift.shape.cross_section import distance_inside
 from fluidlift.shape.depth_surface import solid_heights
 from fluidlift.shape.ground_mesh import ground_mesh
-from fluidlift.shape.looked_into import Bowl
+from fluidlift.shape.looked_into import OVER_RIM, Bowl
 from fluidlift.shape.plan import Extent, Plan, PlanEvidence, dry_columns, extent_of, plan_of, wide_ends, with_seen
 from fluidlift.shape.terrain import at_cells, signed_distance_from, to_corners, unit
 from fluidlift.types import CellType, FluidKind, Grid, Label, PinholeCamera, Setting, Terrain, kind_of, triple
@@ -137,10 +137,16 @@ def channel_setting(seen: PlanEvidence, config: ChannelConfig) -> Setting:
 def _within_bowl(ground: _Ground, grid: Grid, bowl: Bowl) -> _Ground:
     """The ground beside the water as wall and rim of the vessel that it stands in, and around that a table as low as
     the bed."""
-    h, table = grid.spacing, float(ground.shown[ground.water].min(initial=np.inf))
-    around = bowl.height(grid.centers()[:, :, 0, :2], LIP * h, SIDE * h, table if np.isfinite(table) else bowl.level.z)
-    shown = np.where(ground.water, ground.shown, around)
-    return _Ground(shown, shown, ground.water)
+    h, away = grid.spacing, bowl.away(grid.centers()[:, :, 0, :2])
+    water = ground.water & (away < OVER_RIM * bowl.rim.radius)
+    if not water.any():
+        return ground
+    table, farthest = float(ground.shown[water].min()), float(away[water].max())
+    # a pixel or two of water beyond the rim are within it
+    wide = replace(bowl, rim=replace(bowl.rim, radius=max(bowl.rim.radius, farthest + 0.5 * h)))
+    around = wide.height(away, LIP * h, SIDE * h, table)
+    shown = np.where(water, ground.shown, around)
+    return _Ground(shown, shown, water)
 
 
 def _channel_grid(surface, low, high, depth, spacing) -> Grid:

@@ -26,6 +26,9 @@ INNER = (1.0, 0.95, 0.9, 0.85)
 LIKENESS = 0.6
 """IoU of what is seen within a rim with the level circle that fits it best, from which that is believed: waves and
 splashes are the rest (a choice)"""
+BESIDE, OVER_RIM = 0.02, 1.1
+"""of the pixels of standing water, those that may lie farther from the axis than so many radii of its rim (a choice:
+outlines err by a pixel or two of 50)"""
 JET = 0.55
 """of the widest row, at most: rows above it that show the jet, which hides the wall and the level alike"""
 TURNS = 64
@@ -88,9 +91,12 @@ class Bowl:
         """Pixels of all of its level, with what its near wall hides."""
         return _away(self.rim, camera, self.level.z) < self.level.radius
 
-    def height(self, xy: Float[np.ndarray, "*n 2"], lip: float, side: float, table: float) -> Float[np.ndarray, "*n"]:
+    def away(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """Distance from the axis."""
+        return np.linalg.norm(xy - np.asarray(self.rim.center[:2]), axis=-1)
+
+    def height(self, away: Float[np.ndarray, "*n"], lip: float, side: float, table: float) -> Float[np.ndarray, "*n"]:
         """z of wall and rim, which is `lip` wide, beside the level; it falls to a table around it over `side`."""
-        away = np.linalg.norm(xy - np.asarray(self.rim.center[:2]), axis=-1)
         inner = max(self.rim.radius, 1.001 * self.level.radius)  # upright at most
         edge = self.rim.center[2]
         places = [self.level.radius, inner, inner + lip, inner + lip + side]
@@ -119,7 +125,10 @@ def bowl_of(camera: PinholeCamera, rim: Ellipse, mask: Bool[np.ndarray, "h w"], 
         likeness, level = _Opening.of(edge, camera, ways, wet).fit(z)
         if level is not None and likeness > best:
             best, found = likeness, Bowl(VesselRim(edge.center, level.inner), level)
-    return found
+    if found is None or not mask.any():
+        return None
+    farthest = float(np.quantile(_away(found.rim, camera, z)[mask], 1.0 - BESIDE))
+    return found if farthest < OVER_RIM * found.rim.radius else None  # what lies beside it has another bank
 
 
 def _ways_down(camera: PinholeCamera) -> Float[np.ndarray, "h w 2"]:

@@ -54,9 +54,10 @@ def rim_circle(camera: PinholeCamera, rim: Ellipse, distance: float) -> VesselRi
         distance: from the camera to the circle's center along the ground.
     """
     flat = _below_eye(camera, rim)
-    if flat is None or flat[0] == 0.0 == flat[1]:  # straight below, no way along the ground tells how far
+    away = 0.0 if flat is None else float(np.hypot(*flat[:2]))
+    if flat is None or away < 1e-6:  # straight below, no way along the ground tells how far
         return None
-    return _scaled(flat, distance / float(np.hypot(*flat[:2])), camera)
+    return _scaled(flat, distance / away, camera)
 
 
 def _below_eye(camera: PinholeCamera, rim: Ellipse) -> tuple[float, float, float] | None:

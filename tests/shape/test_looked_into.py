@@ -132,6 +132,10 @@ def test_a_rim_says_nothing_of_a_pool_beside_it_or_of_one_that_is_as_wide():
     assert truth.mouth is not None
     rim = ellipse_of(camera, truth.mouth)
     beside = Ellipse((rim.center[0] + 60.0, rim.center[1]), rim.covariance, 1.0)
+    saucer = Ellipse((rim.center[0], rim.center[1] + 25.0), 4.0 * rim.covariance, 1.0)
+    found = find_vessel(camera, shown(camera, truth), AWAY, [saucer, rim])
+    assert found is not None and found.mouth is not None
+    assert found.mouth.radius == pytest.approx(truth.mouth.radius, rel=0.05), "and not the saucer's"
     brimful = shown(camera, cup(0.0))
     for mask, other in ((shown(camera, truth), beside), (brimful, rim)):
         found = find_vessel(camera, mask, AWAY, [other])

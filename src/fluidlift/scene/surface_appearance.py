@@ -375,10 +375,12 @@ class SurfaceAppearance:
 
     def _hidden(self, points: np.ndarray) -> np.ndarray:
         """Which points (m) lie behind the wall of a vessel, where the film shows that and not the fluid."""
+        from fluidlift.look.scenery import visible_beside_rocks
+
         if self._wall is None:
             return np.zeros(len(points), bool)
-        row, col, depth = self._camera.nearest_pixels(points)
-        return depth > self._wall[row, col] + BEHIND_WALL * self._cell
+        there = np.isfinite(self._wall)
+        return ~visible_beside_rocks(points, self._camera, self._wall, there, margin=BEHIND_WALL * self._cell)
 
     def _begin_again(self) -> None:
         from fluidlift.look.surface_skin import SurfaceSkin

@@ -47,8 +47,6 @@ FREEBOARD = 0.1
 CUP, BELOW_LEVEL = 1.2, 0.3
 """radii of its rim that a vessel which is looked into is taken to be deep (a choice: bowls have 0.6 to 1, cups 1.2 to
 1.6), and that its floor lies below the level at least"""
-MOSTLY = 0.5
-"""of what is seen within a rim, at least, that lies in its lower half: a level below it is seen there"""
 THICK = 1.15
 """radii of its outside over those of its inside: mugs have walls of a seventh, and cells are coarse"""
 FOOT_RADIUS = 0.5
@@ -186,7 +184,7 @@ def find_vessel(
     if plane is None:
         return None
     if mouth is None:
-        held = next((rim for rim in rims if holds_pool(rim, mask)), None)
+        held = next((rim for rim in rims if in_vessel([rim], mask & ~jet_rows(mask))), None)
         mouth = None if held is None else rim_circle(camera, held, distance)
     level = None if mouth is None else level_below(mouth, camera, mask)
     if mouth is not None and level is not None:
@@ -475,19 +473,13 @@ def in_vessel(rims: Sequence[Ellipse], pool: Bool[np.ndarray, "h w"]) -> bool:
 
 
 def _shows_wall(rim: Ellipse, pool: Bool[np.ndarray, "h w"]) -> bool:
-    """Whether a pool leaves enough of a rim's disc to the vessel's wall: the far arc of a lower level lies lower."""
+    """Whether a pool leaves enough of a rim's disc to the vessel's wall, on the far side: a lower level lies lower."""
     disc = rim.pixels(pool.shape)
     far = disc & (np.arange(len(pool))[:, None] + 0.5 < rim.center[1])
+    if (pool & far).sum() > (pool & disc & ~far).sum():
+        return False
     above, below = (float((part & ~pool).sum() / max(part.sum(), 1)) for part in (far, disc & ~far))
     return bool((pool & disc).sum() < BELOW_ITS_RIM * disc.sum()) or above > max(FAR_WALL, 2.0 * below)
-
-
-def holds_pool(rim: Ellipse, mask: Bool[np.ndarray, "h w"]) -> bool:
-    """Whether a silhouette lies within a rim and below it, but for what comes from above."""
-    lower = mask & (np.arange(len(mask))[:, None] + 0.5 > rim.center[1])
-    within = int((mask & rim.pixels(mask.shape)).sum())
-    below = rim.share_inside(lower) > IN_VESSEL and lower.sum() > MOSTLY * within
-    return bool(below and _shows_wall(rim, mask & ~jet_rows(mask)))
 
 
 def fills_a_vessel(rims: Sequence[Ellipse], shown: Bool[np.ndarray, "t h w"], *, pitch: float) -> bool:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fluidlift.shape.view.roundness import Ellipse
+from fluidlift.shape.view.roundness import Ellipse, conic_below
 from fluidlift.types import PinholeCamera, VesselRim, triple
 
 DEEPEST, STEP = 1.6, 0.02
@@ -31,8 +31,6 @@ BESIDE, OVER_RIM = 0.02, 1.1
 outlines err by a pixel or two of 50)"""
 JET = 0.55
 """of the widest row, at most: rows above it that show the jet, which hides the wall and the level alike"""
-TURNS = 64
-"""places on a circle"""
 
 
 @dataclass(frozen=True)
@@ -63,16 +61,13 @@ def rim_circle(camera: PinholeCamera, rim: Ellipse, distance: float) -> VesselRi
 def _below_eye(camera: PinholeCamera, rim: Ellipse) -> tuple[float, float, float] | None:
     """x, y from the eye and radius of the circle that an ellipse shows on the level plane one below it; None where it
     reaches up to the horizon."""
-    turn = np.linspace(0.0, 2.0 * np.pi, TURNS, endpoint=False)
-    values, axes = np.linalg.eigh(rim.covariance)
-    outline = rim.center + 2.0 * (np.stack([np.cos(turn), np.sin(turn)], axis=-1) * np.sqrt(values)) @ axes.T
-    rays = camera.rays(outline)
-    if (rays[:, 2] > -1e-3).any():
+    conic = conic_below(camera, rim)
+    if conic is None:
         return None
-    flat = rays[:, :2] / -rays[:, 2:]
-    terms = np.column_stack([2.0 * flat, np.ones(TURNS)])
-    x, y, rest = np.linalg.lstsq(terms, np.square(flat).sum(axis=1), rcond=None)[0]
-    return float(x), float(y), float(np.sqrt(max(rest + x * x + y * y, 0.0)))
+    shape, linear = conic[:2, :2], conic[:2, 2]
+    x, y = -np.linalg.solve(shape, linear)
+    square = -(linear @ (x, y) + conic[2, 2]) / np.sqrt(np.linalg.det(shape))
+    return float(x), float(y), float(np.sqrt(square))  # of what is a little out of round, the circle of its area
 
 
 def _scaled(flat: tuple[float, float, float], scale: float, camera: PinholeCamera) -> VesselRim:
@@ -119,14 +114,13 @@ def bowl_of(camera: PinholeCamera, rim: Ellipse, mask: Bool[np.ndarray, "h w"], 
     within = rim.pixels(mask.shape)
     ways, wet = _ways_down(camera)[within], mask[within]
     deep = float(camera.position[2]) - z
-    for above in np.arange(STEP, DEEPEST, STEP) * flat[2] * deep:
+    heights = np.arange(STEP, DEEPEST, STEP) * flat[2] * deep
+    for above in heights[heights < deep]:
         edge = _scaled(flat, deep - float(above), camera)
-        if deep <= above:
-            break
         likeness, level = _Opening.of(edge, camera, ways, wet).fit(z)
         if level is not None and likeness > best:
             best, found = likeness, Bowl(VesselRim(edge.center, level.inner), level)
-    if found is None or not mask.any():
+    if found is None:
         return None
     farthest = float(np.quantile(_away(found.rim, camera, z)[mask], 1.0 - BESIDE))
     return found if farthest < OVER_RIM * found.rim.radius else None  # what lies beside it has another bank

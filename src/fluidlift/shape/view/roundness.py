@@ -144,16 +144,29 @@ def out_of_round(camera: PinholeCamera, ellipse: Ellipse) -> float:
         camera: level frame, z up, with the tilt that is asked about.
         ellipse: of the picture.
     """
+    conic = conic_below(camera, ellipse)
+    if conic is None:
+        return np.inf
+    small, large = np.linalg.eigvalsh(conic[:2, :2])
+    return float(0.5 * np.log(large / small))
+
+
+def conic_below(camera: PinholeCamera, ellipse: Ellipse) -> Float[np.ndarray, "3 3"] | None:
+    """C with (x, y, 1) C (x, y, 1)' = 0 where an ellipse of the picture meets the level plane one below the camera, x
+    and y from it, negative inside; None where it does not lie below the horizon as a whole.
+
+    Args:
+        camera: z up, with its tilt.
+        ellipse: of the picture.
+    """
     rotation = camera.camera_from_world.rotation
     (fx, fy), (cx, cy) = camera.focal, camera.center
     lens = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     # (x, y, 1) of the plane z = -1 to the picture
     plane = lens @ rotation @ np.diag([1.0, 1.0, -1.0])
     ray = np.array([(ellipse.center[0] - cx) / fx, (ellipse.center[1] - cy) / fy, 1.0]) @ rotation
-    small, large = np.linalg.eigvalsh((plane.T @ ellipse.conic @ plane)[:2, :2])
-    if ray[2] >= 0.0 or small <= 0.0:
-        return np.inf
-    return float(0.5 * np.log(large / small))
+    found = plane.T @ ellipse.conic @ plane
+    return None if ray[2] >= 0.0 or np.linalg.eigvalsh(found[:2, :2])[0] <= 0.0 else found
 
 
 def roundness_evidence(camera: PinholeCamera, ellipses: Sequence[Ellipse]) -> float:

@@ -89,25 +89,24 @@ class RunPanel:
         from fluidlift.export.job import ExportRequest
 
         viewer, out = self._viewer, Path(os.path.expanduser(self._out.value.strip()))
-        if viewer.refused():
+        if viewer.refused() or not viewer.edited(viewer.draft.commit, moves=False):
             return
         if not self._out.value.strip():
-            self._tell_export("Export: no folder. Needed: a name for a new one.")
-            return
-        if "simulate" in (viewer.stale or ()):
-            self._tell_export("Export: the saved frames are older than this scene: press 'Simulate in full' first.")
+            self._exported.content = "Export: no folder. Needed: a name for a new one."
+            viewer.say(self._exported.content)
             return
         request = ExportRequest(to=self._format.value)
 
         def work(progress: JobProgress) -> str:
+            # compared here, however long it takes: what the page knows may be of the scene before the last edit
+            if "simulate" in viewer.draft.stale():
+                raise InputRejected("the saved frames are older than this scene", do="press 'Simulate in full' first")
             return "; ".join(export_asset(viewer.folder, out, request, progress=progress).lines())
 
         if not viewer.jobs.start("export", work):
             viewer.say("Something else is being done already.")
-
-    def _tell_export(self, text: str) -> None:
-        self._exported.content = text
-        self._viewer.say(text)
+            return
+        self._exporting = True  # also where it has ended before the page looks
 
     def _draw(self, event: Any) -> None:
         viewer = self._viewer

@@ -34,8 +34,8 @@ def test_a_jet_into_a_cup_stays_a_pour_and_one_into_a_puddle_is_a_stream():
 def test_a_vessel_fills_where_a_jet_falls_in_and_more_of_its_liquid_is_seen():
     pools = [((COL - 80) / a) ** 2 + ((ROW - 100) / (0.64 * a)) ** 2 < 1 for a in np.linspace(42.0, 52.0, 6)]
     rising = np.stack([JET | pool for pool in pools])
-    assert fills_a_vessel([RIM], rising, pitch=40.0)
-    assert not fills_a_vessel([], rising, pitch=40.0)
-    assert not fills_a_vessel([RIM], rising[::-1], pitch=40.0), "it empties"
-    assert not fills_a_vessel([RIM], np.stack([rising[3]] * 6), pitch=40.0), "its level stands"
-    assert not fills_a_vessel([RIM], np.stack(pools), pitch=40.0), "nothing falls in"
+    assert fills_a_vessel([RIM], rising)
+    assert not fills_a_vessel([], rising)
+    assert not fills_a_vessel([RIM], rising[::-1]), "it empties"
+    assert not fills_a_vessel([RIM], np.stack([rising[3]] * 6)), "its level stands"
+    assert not fills_a_vessel([RIM], np.stack(pools)), "nothing falls in"

@@ -17,7 +17,6 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from fluidlift.shape.ground_mesh import VertexLook
-from fluidlift.shape.jets import airborne_pixels, find_neck, lying_pixels
 from fluidlift.shape.looked_into import Level, jet_rows, level_below, rim_circle, seen_through
 from fluidlift.shape.region import largest_piece
 from fluidlift.shape.view.roundness import IN_VESSEL, Ellipse
@@ -482,27 +481,27 @@ def _shows_wall(rim: Ellipse, pool: Bool[np.ndarray, "h w"]) -> bool:
     return bool((pool & disc).sum() < BELOW_ITS_RIM * disc.sum()) or above > max(FAR_WALL, 2.0 * below)
 
 
-def fills_a_vessel(rims: Sequence[Ellipse], shown: Bool[np.ndarray, "t h w"], *, pitch: float) -> bool:
+def fills_a_vessel(rims: Sequence[Ellipse], shown: Bool[np.ndarray, "t h w"]) -> bool:
     """Whether a thin jet falls into a vessel and what is seen of the liquid in that becomes more.
 
     Args:
         rims: of vessels that are seen.
         shown: fluid pixels of some frames, spread over the clip.
-        pitch: degrees that the camera looks down.
     """
     for rim in rims:
         areas = np.array([rim.share_inside(mask) * mask.sum() for mask in shown])
         third = max(len(areas) // 3, 1)
         if areas[-third:].mean() - areas[:third].mean() < FILLS * max(areas.mean(), 1.0):
             continue
-        necks = [_neck_within(rim, mask, pitch) for mask in shown]
-        if np.mean(necks) > 0.5:
+        if np.mean([_jet_into(rim, mask) for mask in shown]) > 0.5:
             return True
     return False
 
 
-def _neck_within(rim: Ellipse, mask: np.ndarray, pitch: float) -> bool:
-    """Whether the silhouette shows a jet above a pool that lies in a vessel."""
+def _jet_into(rim: Ellipse, mask: np.ndarray) -> bool:
+    """Whether the silhouette shows a jet, longer than wide, above a pool below a rim, however little there is of
+    that yet."""
     piece = largest_piece(mask)
-    neck = find_neck(piece, pitch=pitch) if piece.any() else None
-    return neck is not None and in_vessel([rim], lying_pixels(piece, airborne_pixels([neck], mask.shape)))
+    jet = jet_rows(piece)
+    rows = jet.sum(axis=1)[jet.any(axis=1)]
+    return bool(len(rows)) and len(rows) > float(np.median(rows)) and in_vessel([rim], piece & ~jet)

@@ -23,7 +23,7 @@ from fluidlift.shape.view.habit import ROLL
 from fluidlift.types import FluidKind, KindEvidence, PinholeCamera, RigidTransform, UpEvidence, kind_of
 from fluidlift.types.flow import TRUSTED
 from fluidlift.types.kind import KINDS as FLUID_KINDS
-from fluidlift.types.kind import LOOKING_DOWN, STREAM
+from fluidlift.types.kind import STREAM
 
 KINDS: tuple[str, ...] = tuple(name for name, kind in FLUID_KINDS.items() if kind.recognised)
 """names of the kinds whose evidence is weighed"""
@@ -144,8 +144,7 @@ def estimate_kind(
     f["returning"] *= 1.0 - f["thrown"]  # what rises comes back as well
     wet = np.any(fluid, axis=0)
     f["contained"] = max((rim.share_inside(wet) for rim in rims), default=0.0)
-    looks_down = LOOKING_DOWN[0] if pitch is None else pitch
-    f["vessel filled by a jet"] = float(fills_a_vessel(rims, fluid, pitch=looks_down))
+    f["vessel filled by a jet"] = float(fills_a_vessel(rims, fluid))
     weighed = terms(f, pitch)
     values = np.array([sum(w * weighed[term] for term, w in WEIGHTS[kind].items()) for kind in KINDS])
     share = np.exp(values - values.max())

@@ -1,10 +1,7 @@
 import numpy as np
 
-from fluidlift.shape.composite import split
 from fluidlift.shape.filled_vessel import fills_a_vessel, in_vessel
 from fluidlift.shape.view import drawn_rim
-from fluidlift.types import PinholeCamera, UpEvidence
-from fluidlift.types.kind import POUR, STREAM
 
 H, W = 160, 160
 ROW, COL = np.mgrid[:H, :W] + 0.5
@@ -19,16 +16,6 @@ def test_a_pool_below_a_rim_lies_in_a_vessel():
     assert not in_vessel([], POOL)
     assert not in_vessel([ITS_OWN], POOL), "the outline of a puddle is no rim"
     assert not in_vessel([drawn_rim((30.0, 90.0), (68.0, 46.0), 0.0)], POOL)
-
-
-def test_a_jet_into_a_cup_stays_a_pour_and_one_into_a_puddle_is_a_stream():
-    camera = PinholeCamera.from_fov(40.0, (W, H))
-    mask, still = JET | POOL, np.zeros((H, W, 2))
-    said = (camera, UpEvidence(40.0, 0.0, "", 1.0), mask, still, np.zeros((H, W)))
-    kind, parts = split(POUR, *said, free=True)
-    assert kind == STREAM and parts.puddle
-    kind, parts = split(POUR, *said, free=True, rims=[RIM])
-    assert kind == POUR and not parts.puddle and not parts.outlines
 
 
 def test_a_vessel_fills_where_a_jet_falls_in_and_more_of_its_liquid_is_seen():

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from fluidlift.shape.jets import JetOutline
-from fluidlift.shape.puddle import down_to_landing, jet_over_spreading, jets_into_puddle
+from fluidlift.shape.puddle import down_to_landing, jet_over_pool, jets_into_puddle
 from fluidlift.types import PinholeCamera, UpEvidence
 
 H, W = 160, 160
@@ -49,13 +49,13 @@ def test_a_round_vessel_seen_level_is_no_puddle():
 
 
 def test_over_what_spreads_the_silhouette_shows_the_jet():
-    found = jet_over_spreading(UpEvidence(40.0, 0.0, "", 1.0), JET | pool(32.0))
+    found = jet_over_pool(UpEvidence(40.0, 0.0, "", 1.0), JET | pool(32.0))
     assert found is not None and len(found.jets) == 1
     outline = found.jets[0]
     assert outline.pixels[20:60, 80].all() and not outline.pixels[100:].any()
     assert outline.half_widths == pytest.approx(7.0, abs=1.0)
     assert found.lying[130, 80] and not found.lying[20, 80]
-    assert jet_over_spreading(None, pool(32.0)) is None, "there is none"
+    assert jet_over_pool(None, pool(32.0)) is None, "there is none"
 
 
 def test_without_a_jet_there_is_no_puddle():

@@ -403,14 +403,10 @@ def _kind_and_up(
         others = [k for k in evidence.scores if not kind_of(k).starts_at_rest]
         kind = kind_of(max(others, key=lambda k: evidence.scores[k]))
     if bodies is None:
-        kind, parts = composite.split(
-            kind, known, surveyed if pose_given else None, mask, motion, trust, free=c.kind == "auto",
-            rims=said.rims or looked.rims,
-        )  # fmt: skip
+        tilt = surveyed if pose_given else None
+        parts = composite.split(kind, known, tilt, mask, motion, trust)
         if c.kind == "auto" and (kind.fills_vessel or kinds.spreads(evidence)):
-            tilt = surveyed if pose_given else None
-            poured = puddle.jet_over_spreading(tilt, mask) if kinds.spreads(evidence) else None
-            poured = poured or puddle.jets_into_puddle(known, tilt, mask, motion, trust)
+            poured = puddle.jet_over_pool(tilt, mask) or puddle.jets_into_puddle(known, tilt, mask, motion, trust)
             if poured is not None and not filled_vessel.in_vessel(said.rims or looked.rims, poured.lying):
                 kind, parts = STREAM, composite.BodyParts(poured.jets, poured.lying, puddle=True)
     else:

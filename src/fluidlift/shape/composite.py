@@ -13,16 +13,14 @@ from scipy import ndimage
 from fluidlift.messages import NONE, Notice
 from fluidlift.shape import airborne, chute, jets, registration
 from fluidlift.shape.drawn import region_pixels
-from fluidlift.shape.filled_vessel import in_vessel
 from fluidlift.shape.fountain_columns import find_columns
 from fluidlift.shape.jet_column import Jet, with_columns
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.slope import LEVEL
 from fluidlift.shape.surface import FrontSurface
-from fluidlift.shape.view import Ellipse
 from fluidlift.types import GRAVITY, FluidKind, MetricScale, PinholeCamera, Setting, Similarity3, UpEvidence
 from fluidlift.types.hints import DrawnView
-from fluidlift.types.kind import LOOKING_DOWN, POUR, STREAM
+from fluidlift.types.kind import LOOKING_DOWN, POUR
 
 LEVEL_SAID = 0.999
 """share of streams that are level among those of which a person says so"""
@@ -62,14 +60,8 @@ def split(
     mask: Bool[np.ndarray, "h w"],
     motion: Float[np.ndarray, "h w 2"],
     trust: Float[np.ndarray, "h w"],
-    *,
-    free: bool,
-    rims: Sequence[Ellipse] = (),
-) -> tuple[FluidKind, BodyParts]:
-    """The kind of the lying part, and the parts.
-
-    A pour whose mask is a wide puddle below narrow threads is a stream with jets: a puddle does not stand on edge. What
-    lies below the rim of a vessel is no puddle.
+) -> BodyParts:
+    """The parts of a fluid.
 
     Args:
         kind: as it was found or given.
@@ -78,24 +70,13 @@ def split(
         mask: fluid pixels.
         motion: mean over the clip, px per frame.
         trust: of it.
-        free: whether the kind may change (the user did not give it).
-        rims: of vessels that are seen.
     """
     usual = kind.pitch_prior[0] if kind.rises_from_pool else LOOKING_DOWN[0]
     tilt = up or UpEvidence(usual, 0.0, "", 0.0)
-    found: list[jets.JetOutline] = []
-    neck = None
     if kind.rises_from_pool:
-        return kind, BodyParts(*_rising(mask, motion, trust, tilt))
-    if kind.runs_nearly_level:
-        found = jets.find_jets(level_camera(camera, tilt), mask, motion, trust)
-    elif kind.fills_vessel and free:
-        neck = jets.find_neck(mask, pitch=tilt.pitch)
-        if neck is not None and in_vessel(rims, jets.lying_pixels(mask, jets.airborne_pixels([neck], mask.shape))):
-            neck = None
-        kind, found = (STREAM, [neck]) if neck is not None else (kind, [])
-    lying = jets.lying_pixels(mask, jets.airborne_pixels(found, mask.shape))
-    return kind, BodyParts(tuple(found), lying, puddle=neck is not None)
+        return BodyParts(*_rising(mask, motion, trust, tilt))
+    found = jets.find_jets(level_camera(camera, tilt), mask, motion, trust) if kind.runs_nearly_level else []
+    return BodyParts(tuple(found), jets.lying_pixels(mask, jets.airborne_pixels(found, mask.shape)))
 
 
 def _rising(mask, motion, trust, tilt: UpEvidence) -> tuple[tuple[jets.JetOutline, ...], np.ndarray]:

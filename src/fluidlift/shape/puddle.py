@@ -1,9 +1,9 @@
 """Puddles that jets fall into, seen from above: told from a vessel seen from the side.
 
 Where a jet ends in a still pool the silhouette alone does not tell a puddle that lies from a body that hangs: the jet
-is seen by its motion (shape/jets.py), and a pool that is round lies where its outline is an ellipse wider than tall.
-What spreads from its foot (shape/spreading.py) moves faster than a smooth jet seems to: there the silhouette says which
-is the jet.
+is seen by its motion (shape/jets.py) or as a neck of the silhouette, and a pool that is round lies where its outline
+is an ellipse wider than tall: what a glass holds is often wider than tall as well, and no ellipse. What spreads from
+the foot of a jet (shape/spreading.py) moves faster than that seems to: there the silhouette alone says which is which.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def jets_into_puddle(
     return _poured(found, up, mask)
 
 
-def jet_over_spreading(up: UpEvidence | None, mask: Bool[np.ndarray, "h w"]) -> Poured | None:
-    """The jet that the silhouette shows above a round pool in which it spreads; None where it shows none.
+def jet_over_pool(up: UpEvidence | None, mask: Bool[np.ndarray, "h w"]) -> Poured | None:
+    """The jet that the silhouette shows above a round pool; None where it shows none.
 
     Args:
         up: tilt of the camera, where that is known.

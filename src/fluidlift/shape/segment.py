@@ -148,7 +148,7 @@ class Clues:
         """bool [h,w], the fluid grown from its streams, where change does not tell it; else None."""
         if self.horizon is not None or trustworthy(self.score):
             return None
-        return grown_from_streams(self.evidence, self.inside)
+        return grown_from_streams(self.evidence, self.inside & ~self.solids)
 
     @cached_property
     def advances(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,7 +35,7 @@ def card_against(folder: Path, video: Path, *, start: float = 0.0, progress: Pro
 
     Args:
         folder: of the asset, with its work/.
-        video: of the same camera, with the frame rate of the clip.
+        video: of the same camera, with as many frames per second as the asset at least.
         start: s from the beginning of the video.
         progress: where progress is told.
 
@@ -63,7 +64,13 @@ def card_against(folder: Path, video: Path, *, start: float = 0.0, progress: Pro
     decode = partial(read_clip, video, start=start, duration=(count + 1) * interval, max_size=max(asset.camera.size))
     read = manifest["provenance"]["config"]["read"]
     other = between_bars(decode)[0] if read.get("crop") == "auto" else decode()
-    _check(other, footage.clip, interval)
+    if other.size != footage.clip.size:
+        raise InputRejected(
+            f"footage that is {other.size[0]} x {other.size[1]} px in the asset's size",
+            f"a picture of the shape of the clip, {footage.clip.size[0]} x {footage.clip.size[1]} px",
+            "use the same camera",
+        )
+    other = at_rate(other, interval)
     first = own if count - own >= FEWEST else 0
     last = min(count, first + len(other))
     if min(last - first, len(other)) < FEWEST:
@@ -78,17 +85,27 @@ def card_against(folder: Path, video: Path, *, start: float = 0.0, progress: Pro
     return as_filmed(other.frames, masks, interval, renders, coverage, runs=not stands)
 
 
-def _check(other: VideoClip, clip: VideoClip, interval: float) -> None:
-    if other.size != clip.size:
+def at_rate(clip: VideoClip, interval: float) -> VideoClip:
+    """Footage without the frames that repeat the one before and, where it has more than one each interval (s), those
+    nearest to an asset's instants.
+
+    Raises:
+        InputRejected: it has fewer.
+    """
+    from fluidlift.motion.cadence import examine_cadence, without_duplicates
+
+    found = without_duplicates(clip, examine_cadence(clip.frames, clip.times))
+    own = float(found.times[-1] - found.times[0]) / max(len(found) - 1, 1)
+    if own > interval * (1.0 + SAME_RATE):
         raise InputRejected(
-            f"footage that is {other.size[0]} x {other.size[1]} px in the asset's size",
-            f"a picture of the shape of the clip, {clip.size[0]} x {clip.size[1]} px", "use the same camera",
+            f"footage of {1 / own:.4g} frames per second and an asset of {1 / interval:.4g}",
+            "as many frames per second at least", "take the footage that has them",
         )  # fmt: skip
-    if abs(other.interval / interval - 1.0) > SAME_RATE:
-        raise InputRejected(
-            f"footage of {1 / other.interval:.4g} frames per second and an asset of {1 / interval:.4g}",
-            "the same rate", "convert the footage",
-        )  # fmt: skip
+    if own > interval * (1.0 - SAME_RATE):
+        return found
+    instants = np.arange(found.times[0], found.times[-1] + 0.5 * own, interval)
+    nearest = np.abs(found.times - instants[:, None]).argmin(axis=1)
+    return replace(found, frames=found.frames[nearest], times=instants, alpha=None)
 
 
 def _renders(folder: Path, view: FrontView, numbers: range, progress: Progress) -> tuple[np.ndarray, np.ndarray]:

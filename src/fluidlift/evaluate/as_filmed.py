@@ -212,7 +212,7 @@ def as_filmed(
     places, foam, half = Places.of(masks), Foam.of(clip, masks), len(clip) // 2
     moves = places.stays < STAYS
     longer = max(len(renders) - len(clip), 0)
-    after = 0 if moves else _comparable(longer, len(clip), growth(masks) if fills else 0.0)
+    after = comparable(masks, longer, fills=fills)
     later = renders[len(clip) : len(clip) + after] if after >= FEWEST else renders[:0]
 
     def statistics(
@@ -249,9 +249,18 @@ def as_filmed(
     return AsFilmed(length, len(later), figures, notes, tuple(_advice(figures, value, beyond)))
 
 
-def _comparable(longer: int, frames: int, grows: float) -> int:
-    """Of `longer` frames after the end of a clip of `frames`, those with as much fluid as it has on average."""
-    return longer if not grows else int(np.clip(GROWS / abs(grows) - frames / 2, 0, longer))
+def comparable(masks: Bool[np.ndarray, "t h w"], longer: int, *, fills: bool) -> int:
+    """Of `longer` frames after the end of a clip, those in which its fluid is where it was filmed most of the time.
+
+    Args:
+        masks: where fluid was filmed.
+        longer: frames.
+        fills: as of `as_filmed`.
+    """
+    if Places.of(masks).stays < STAYS:
+        return 0
+    grows = growth(masks) if fills else 0.0
+    return longer if not grows else int(np.clip(GROWS / abs(grows) - len(masks) / 2, 0, longer))
 
 
 def _notes(moves: bool, longer: int, judged: int) -> tuple[str, ...]:

@@ -40,9 +40,10 @@ def card_against(folder: Path, video: Path, *, start: float = 0.0, progress: Pro
         progress: where progress is told.
 
     Raises:
-        InputRejected: no asset, an edited one, or footage that does not fit it.
+        InputRejected: no asset, an edited one, one whose fluid is elsewhere at another time, or footage that does not
+            fit it.
     """
-    from fluidlift.evaluate.as_filmed import FEWEST, as_filmed
+    from fluidlift.evaluate.as_filmed import FEWEST, as_filmed, comparable
     from fluidlift.io.asset_folder import load_asset, read_manifest
     from fluidlift.io.bars import between_bars
     from fluidlift.io.video import read_clip
@@ -72,7 +73,14 @@ def card_against(folder: Path, video: Path, *, start: float = 0.0, progress: Pro
         )
     other = at_rate(other, interval)
     first = own if count - own >= FEWEST else 0
-    last = min(count, first + len(other))
+    masks, kind = footage.labels.fluid[footage.start :], kind_of(scene.kind)
+    there = comparable(masks, count, fills=kind.fills_vessel)
+    if there < FEWEST:
+        raise InputRejected(
+            f"'{folder.name}' cannot be held against other footage: its fluid moves, grows or shrinks in the picture",
+            "one that is at another time where it was filmed", "compare it with its own clip: fluidlift evaluate ASSET",
+        )  # fmt: skip
+    last = min(count, first + len(other), own + there)
     if min(last - first, len(other)) < FEWEST:
         raise InputRejected(
             f"{len(other)} frames of '{video.name}' and {last - first} of the asset", f"{FEWEST} or more of each",
@@ -80,9 +88,8 @@ def card_against(folder: Path, video: Path, *, start: float = 0.0, progress: Pro
         )  # fmt: skip
     progress.stage("compare", 1, 1)
     renders, coverage = _renders(folder, FrontView.of(scene, footage), range(first, last), progress)
-    masks = np.broadcast_to(footage.labels.fluid.mean(axis=0) > 0.5, other.frames.shape[:3])
-    stands = kind_of(scene.kind).is_still_water
-    return as_filmed(other.frames, masks, interval, renders, coverage, runs=not stands)
+    usual = np.broadcast_to(masks.mean(axis=0) > 0.5, other.frames.shape[:3])
+    return as_filmed(other.frames, usual, interval, renders, coverage, runs=not kind.is_still_water)
 
 
 def at_rate(clip: VideoClip, interval: float) -> VideoClip:

@@ -85,6 +85,12 @@ def test_footage_of_another_shape_is_refused(made, clip_file, pictures, tmp_path
     assert "the same camera" in capsys.readouterr().err
 
 
+def test_a_fluid_that_is_elsewhere_at_another_time_is_not_compared(made, monkeypatch, capsys):
+    monkeypatch.setattr("fluidlift.evaluate.as_filmed.comparable", lambda masks, longer, *, fills: 0)
+    assert main(["evaluate", str(made.folder), "--clip", str(made.clip), "--start", "0.12"]) == REJECTED
+    assert "its fluid moves, grows or shrinks in the picture" in capsys.readouterr().err
+
+
 def a_footage(frames: int, height: int = 48, width: int = 64) -> Footage:
     """Still grey water in the middle of a still picture."""
     fluid = np.zeros((frames, height, width), bool)

@@ -508,6 +508,18 @@ def test_in_a_shaken_picture_the_fluid_grows_from_where_it_streams():
     assert overlap(grown, puddle) > 0.85
 
 
+def test_what_moves_as_a_solid_is_left_out_where_fluid_grows():
+    pictures, puddle = shaken_honey()
+    flow = no_flow()
+    flow.displacement[:, 50:70, 60:110, 0] = 2.0
+    known = clues_of(clip_of(pictures), flow)
+    jug = np.zeros((HEIGHT, WIDTH), bool)
+    jug[:, 95:] = True
+    assert known.grown is not None and known.grown[jug & puddle].mean() > 0.8
+    grown = replace(known, solids=jug).grown
+    assert grown is not None and not grown[jug].any() and grown[puddle & ~jug].mean() > 0.8
+
+
 def test_without_anything_that_streams_nothing_grows():
     evidence = gather_evidence(clip_of(shaken_honey()[0]), no_flow())
     assert grown_from_streams(evidence, np.ones((HEIGHT, WIDTH), bool)) is None

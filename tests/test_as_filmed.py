@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from fluidlift.evaluate.as_filmed import FEWEST, GOOD, USABLE, VERDICTS, WRONG, AsFilmed, Likeness, as_filmed
-from fluidlift.evaluate.film import mean_flow, mean_flows
+from fluidlift.evaluate.film import growth, mean_flow, mean_flows
 from fluidlift.motion.optical_flow import DenseInverseSearch
 
 T, H, W = 48, 64, 96
@@ -234,7 +234,7 @@ def test_the_verdict_is_the_worst_of_those_that_are_judged():
     assert VERDICTS[-1] == WRONG
 
 
-def filling(frames: int, first: int, last: int) -> np.ndarray:
+def filling(frames: int, first: float, last: float) -> np.ndarray:
     """[frames,H,W]: the row of the surface goes from `first` to `last`, each filled from the left to the right."""
     rows = np.linspace(first, last, frames)[:, None, None]
     place = np.arange(H)[:, None] + 1.0 - np.arange(W) / W
@@ -248,6 +248,19 @@ def test_a_vessel_that_goes_on_to_fill_is_not_held_against_how_full_it_was(clip,
     assert as_filmed(clip, fills[:T], INTERVAL, np.concatenate([clip] * 3), fills).beyond == 2 * T, "a fall in the wind"
     assert abs(card.beyond - judged) <= 2 and "steadily" in card.notes[0]
     assert card["level"].verdict == GOOD
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_vessel_fills_though_the_jet_above_it_sways(seed):
+    frames, rng = 36, np.random.default_rng(seed)
+    fills, still = filling(frames, 20, 19.5), filling(frames, 20, 20)
+    jet = np.zeros_like(fills)
+    for t, wide in enumerate(np.abs(rng.normal(0.0, 10.0, frames)).round().astype(int)):
+        jet[t, :2, :wide] = True
+    areas = (fills | jet).sum(axis=(1, 2))
+    assert np.corrcoef(np.arange(frames), areas)[0, 1] ** 2 < 0.8, "a straight line does not explain most of it"
+    assert growth(fills | jet) == pytest.approx(growth(fills), rel=0.5)
+    assert growth(still | jet) == 0.0
 
 
 def test_a_level_that_goes_up_and_down_is_held_to_its_mean_after_the_clip():

@@ -33,9 +33,11 @@ further than where a wrong level shows"""
 CELL = 1.0 / 32.0
 """side of the places in which foam is counted, over the longer side of the picture"""
 
-STEADY_GROWTH = 0.8
-"""share of the variance of a fluid's area that its growth explains: of a whole wave, which comes back, a straight line
-explains 6 / pi^2 = 0.61"""
+SURE_GROWTH = 2.0
+"""standard errors by which a fluid's area must grow over a clip"""
+FEWEST_ALONE = 3.0
+"""frames that count as independent at least: a straight line must explain 0.8 of what varies then; of a whole wave,
+which comes back, it explains 6 / pi^2 = 0.61"""
 
 NO_MAP: Any = None
 """OpenCV takes the rows from a second map unless there is none, which its stub does not know"""
@@ -75,15 +77,20 @@ class Places:
 def growth(masks: Bool[np.ndarray, "t h w"]) -> float:
     """Share of its mean area by which a fluid grows from frame to frame (negative: shrinks), as in a vessel that fills.
 
-    Least squares over the frames; 0 where a straight line does not explain `STEADY_GROWTH` of the variance, as with
-    waves on a beach.
+    Least squares over the frames; 0 where it is less than `SURE_GROWTH` standard errors, as with waves on a beach. What
+    is left over of neighboring frames is alike: of n with a correlation r, n (1 - r) / (1 + r) are independent.
     """
     areas = masks.reshape(len(masks), -1).sum(axis=1).astype(float)
     if len(masks) < 3 or areas.std() <= 1e-9 * areas.mean():
         return 0.0
-    time = np.arange(len(masks))
-    slope = np.polyfit(time, areas, 1)[0]
-    return float(slope / areas.mean()) if np.corrcoef(time, areas)[0, 1] ** 2 > STEADY_GROWTH else 0.0
+    time = np.arange(len(masks)) - 0.5 * (len(masks) - 1)
+    slope = float(time @ areas / (time @ time))
+    rest = areas - areas.mean() - slope * time
+    power = float(rest @ rest)
+    alike = min(max(float(rest[1:] @ rest[:-1]) / power, 0.0), 1.0) if power > 0 else 0.0
+    alone = max(len(masks) * (1.0 - alike) / (1.0 + alike), FEWEST_ALONE)
+    surely = slope * slope * float(time @ time) * (alone - 2.0) > SURE_GROWTH**2 * power
+    return slope / float(areas.mean()) if surely else 0.0
 
 
 def _grown(mask: np.ndarray, radius: int) -> np.ndarray:

@@ -1,6 +1,7 @@
 """The weights of the kinds are those that the script fits to the table of clips."""
 
 import importlib
+import json
 import sys
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import log_softmax
 
-from fluidlift.shape.kind import KINDS
+from fluidlift.shape.kind import KINDS, terms
 from fluidlift.shape.kind_weights import WEIGHTS
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
@@ -63,3 +64,20 @@ def test_looks_take_the_place_of_those_of_the_same_part(fit, tmp_path):
         ("first", 0.1),
         ("middle", 0.2),
     ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "stays"),
+    [
+        ({}, 1.0),
+        ({"contained": 0.0}, 0.0),  # no rim is seen around it
+        ({"hanging": 1.0}, 0.0),  # it comes in from beyond the picture
+        ({"falling": 0.9}, 0.1),
+        ({"vessel filled by a jet": 1.0}, 0.0),
+    ],
+    ids=["boils", "lies open", "hangs", "falls", "fills"],
+)
+def test_what_a_vessel_holds_stays_in_it(fit, changes, stays):
+    none = dict.fromkeys(json.loads(fit.TABLE.read_text(encoding="utf-8"))["looks"][0]["features"], 0.0)
+    found = terms(none | {"contained": 0.95, "enclosed": 1.0} | changes, None)
+    assert found["staying"] == pytest.approx(stays) and found["staying inside"] <= found["staying"]

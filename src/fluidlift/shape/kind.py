@@ -165,7 +165,10 @@ def terms(f: dict[str, float], pitch: float | None) -> dict[str, float]:
     lies = 1.0 - slender  # what runs off the drops beside a jet goes any way
     lifted = float(np.clip((f["rising"] - ALL_RISES[0]) / (ALL_RISES[1] - ALL_RISES[0]), 0.0, 1.0))
     inside = f["enclosed"] * (1.0 - f["hanging"])  # what ends within the picture passes nothing on
-    staying = max(f["swinging"], inside * f["circling"], lies * f["returning"], f["horizon"], f["bay"])
+    vessel = min(f["contained"] / IN_VESSEL, 1.0)
+    # what a vessel holds stays in it, whatever it does there but fall, unless a jet fills that
+    held = vessel * inside * (1.0 - f["falling"]) * (1.0 - f["vessel filled by a jet"])
+    staying = max(f["swinging"], inside * f["circling"], lies * f["returning"], f["horizon"], f["bay"], held)
     plain = ("rising", "sideways", "falling", "followed", "wide", "bulky", "hanging", "changing", "grey",
              "foreground", "thrown", "contained", "collapsing", "drawn across", "drawn down",
              "vessel filled by a jet")  # fmt: skip
@@ -173,7 +176,7 @@ def terms(f: dict[str, float], pitch: float | None) -> dict[str, float]:
         {"always": 1.0}
         | {name: f[name] for name in plain}
         | {
-            "vessel": min(f["contained"] / IN_VESSEL, 1.0),
+            "vessel": vessel,
             "slender": slender,
             "grey and rising": f["grey"] * f["rising"],
             # it goes up and out at the top

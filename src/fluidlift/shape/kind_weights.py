@@ -60,7 +60,7 @@ WEIGHTS = {
     "plume": {
         "always": -1.11,
         "rising": 2.03,
-        "sideways": -0.76,
+        "sideways": -0.75,
         "falling": -1.54,
         "hanging": 0.07,
         "changing": 0.61,
@@ -89,7 +89,7 @@ WEIGHTS = {
         "always": -2.59,
         "falling": -1.52,
         "changing": -1.56,
-        "grey": -0.07,
+        "grey": -0.08,
         "contained": 0.75,
         "drawn across": 0.78,
         "drawn down": -0.81,
@@ -98,7 +98,7 @@ WEIGHTS = {
         "wide and still": 0.63,
         "wide foreground": 1.51,
         "staying": 4.55,
-        "staying inside": 1.13,
+        "staying inside": 1.12,
         "seen from above": 1.15,
     },
     "fountain": {

@@ -3,7 +3,9 @@
 Workers and runs share them: an asset lies in `.assets/`, under a name that holds a hash of everything that it depends
 on, and is made under a lock by whoever asks first. Tests read it; those that change it work on a copy.
 
-    python tests/catalogue.py --record        write what `test_same_bytes.py` compares with, on this machine
+    python tests/catalogue.py --record        write what `test_same_bytes.py` compares with, after a change of results:
+                                              for this machine alone, as what others have recorded is of before
+    python tests/catalogue.py --add           the same, beside the others: no result has changed since they recorded
     python tests/catalogue.py --against REV   compare with the assets that the code of another commit makes here
 """
 
@@ -236,12 +238,13 @@ def main() -> int:
     """The commands above; without any, the digests as the last line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--record", action="store_true")
+    parser.add_argument("--add", action="store_true")
     parser.add_argument("--against", metavar="REV")
     parser.add_argument("--shelf", type=Path)
     options = parser.parse_args()
     now = _all_digests(options.shelf)
-    if options.record:
-        known = json.loads(RECORDED.read_text()) if RECORDED.is_file() else {}
+    if options.record or options.add:
+        known = json.loads(RECORDED.read_text()) if options.add and RECORDED.is_file() else {}
         RECORDED.write_text(json.dumps(known | {fingerprint(): now}, indent=1, sort_keys=True) + "\n")
         return 0
     if options.against:

@@ -117,11 +117,12 @@ def test_ripples_across_the_picture_lie_and_do_not_fall():
     assert lying.scores["stream"] > 3.0 * plain.scores["stream"]
 
 
-def towards_the_viewer(near=4.0, far=0.2):
+def towards_the_viewer(near=4.0, far=0.2, length=None):
     """A curtain's outline and motion, with a pattern that moves by `far` px per frame at its top and `near` below;
-    where it recedes, seen at a slant, it is foreshortened."""
+    where it recedes, seen at a slant, it is foreshortened. `length` of the pattern down the picture over 2 px across,
+    in px; None: as it is seen."""
     frames, masks, *flow = curtain()
-    length = 2.0 if far >= near else 1.0
+    length = length or (2.0 if far >= near else 1.0)
     pattern = gaussian_filter(np.random.default_rng(0).normal(size=(H, W)), (length, 2.0), mode="wrap")
     pattern *= 30.0 / pattern.std()
     step = np.interp(np.arange(H), [12, 75], [far, near])
@@ -138,6 +139,14 @@ def test_what_recedes_comes_towards_the_viewer_and_does_not_fall():
     assert upright.kind == "fall"
     assert lying.scores["fall"] < 0.5 * upright.scores["fall"]
     assert lying.scores["stream"] > 2.0 * upright.scores["stream"]
+
+
+def test_what_draws_its_pattern_out_downwards_falls_though_it_seems_to_recede():
+    """A curtain that breaks up on its way down has the finer pattern above, as what is farther away has."""
+    threads = estimate_kind(*towards_the_viewer(length=6.0))
+    assert threads.features["receding"] > 0.8
+    assert threads.features["falling"] > 0.5
+    assert threads.kind == "fall"
 
 
 def poured_into_a_tray():

@@ -137,8 +137,10 @@ def estimate_kind(
     f = _features(frames, fluid, displacement, confidence) | {"swinging": 0.0 if bulk is None else swinging(*bulk)}
     f |= _open_water(frames, fluid, displacement, confidence, bulk)
     # down in the picture is towards the viewer on what recedes from him, and on what spreads and loses its speed; a jet
-    # that splashes at its foot seems to recede
-    f["falling"] *= 1.0 - max(f["receding"] * (1.0 - f["slender"]), f["spreading"])
+    # that splashes at its foot seems to recede, and so does a curtain that breaks up on its way, but no ground that
+    # recedes draws its pattern out that way
+    recedes = f["receding"] * (1.0 - f["slender"]) * (1.0 - f["drawn down"])
+    f["falling"] *= 1.0 - max(recedes, f["spreading"])
     f["followed"] *= 1.0 - f["spreading"]
     f["thrown"] = 0.0 if ways is None else thrown_up(ways) * f["followed"]
     f["returning"] *= 1.0 - f["thrown"]  # what rises comes back as well

@@ -142,6 +142,29 @@ def test_a_rim_behind_a_jug_is_found():
     assert rims and likeliest(rims) == pytest.approx(40.0, abs=5.0)
 
 
+@pytest.mark.parametrize(("first", "last"), [(0, 190), (115, 320)])
+def test_a_rim_that_the_pictures_edge_cuts_is_found(first, last):
+    (found, *_) = find_rims(np.ascontiguousarray(cup(40.0)[:, first:last]))
+    (whole, *_) = find_rims(cup(40.0))
+    assert found.center == pytest.approx((whole.center[0] - first, whole.center[1]), abs=3.0)
+    assert found.axes == pytest.approx(whole.axes, rel=0.05)
+
+
+def test_a_dark_cup_beside_a_bright_window_is_found():
+    dim = np.repeat((20 + 0.1 * cup(40.0)[..., :1]).astype(np.uint8), 3, 2)
+    window = cv2.GaussianBlur(np.random.default_rng(2).normal(size=(SIZE[1], 40)).astype(np.float32), (0, 0), 6.0)
+    dim[:, -40:] = np.clip(128 + 60 * window / window.std(), 0, 255)[..., None]
+    rims = find_rims(dim)
+    assert rims and likeliest(rims[:1]) == pytest.approx(40.0, abs=5.0)
+
+
+def test_two_waves_are_no_rim():
+    """Crests that bend towards each other at their ends, 8 px apart."""
+    picture = cv2.GaussianBlur(np.random.default_rng(3).uniform(90, 110, SIZE[::-1]).astype(np.float32), (0, 0), 2.0)
+    cv2.ellipse(picture, (160, 120), (90, 8), 0.0, 0.0, 360.0, 200.0, 2, cv2.LINE_AA)
+    assert find_rims(np.repeat(picture[..., None], 3, 2).astype(np.uint8)) == ()
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_texture_and_a_box_have_no_rims(seed):
     rng = np.random.default_rng(seed)

@@ -47,8 +47,9 @@ SCENE = 5.0
 one key frame: four cameras that moved (hands, one that walks over a torrent) have 8 to 23 cells, three that stood
 before smoke and a jet 1 to 3"""
 SURROUNDS = 20
-"""cells of the grid in which a scene has features, at least. In parts of these clips' pictures smoke and a splash before
-a dark room have them in 7 to 19, and up to 7 hold together over half of the way; those cameras that moved saw 29 to 48"""
+"""cells of the grid in which a scene has features, at least. In parts of these clips' pictures smoke and a splash
+before a dark room have them in 7 to 19, and up to 7 hold together over half of the way; cameras that moved saw 29 to
+48"""
 
 
 def spread_features(picture: np.ndarray, *, per_cell: int = 8) -> np.ndarray:

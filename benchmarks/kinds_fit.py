@@ -41,10 +41,10 @@ LEAST = 0.05
 BY_HAND = {
     # smoke rises from below, is grey, and its outline changes; it neither hangs from above, nor fills the picture,
     # unless all of it goes up and out at the top; a thin plume puffs.
-    # It has no surface, and so no edges
+    # It has no surface, and so no edges; and it takes in air, and widens on its way up
     "plume": {"always": -1.35, "rising": 2.34, "grey": 1.67, "grey and rising": 1.08, "changing": 0.72,
               "falling": -1.8, "sideways": -0.9, "hanging, not lifted": -2.25, "filling": -1.8,
-              "slender and still": -0.9, "lifted and sharp": -2.7, "drawn across": -0.9},
+              "slender and still": -0.9, "lifted and sharp": -2.7, "drawn across": -0.9, "wider below": -2.7},
     # a jet hangs from above, falls and is slender; what falls a few decimetres is too fast for optical flow, and
     # it may be a small part of what it fills
     "pour": {"falling": 1.44, "followed": -1.8, "slender": 2.16, "hanging": 1.44, "wide": -1.08, "bulky": -2.25,

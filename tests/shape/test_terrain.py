@@ -32,6 +32,8 @@ def channel(mainstream=(1.0, 0.0, 0.0), *, slope=0.0, rock=True, along="x", tail
     labels = np.where(np.abs(across) < WIDTH / 2, Label.FLUID, Label.BACKGROUND)
     if tail:  # a thread of falsely marked pixels that runs up the bank
         labels[(np.abs(ground[..., 0]) < 0.04) & (across > 0) & (across < 2.5)] = Label.FLUID
+    if "ends" in options:
+        labels[options.pop("ends")(ground[..., 0], ground[..., 1])] = Label.BACKGROUND
     visible = ground[labels == Label.FLUID]
     if callable(rock):
         labels[rock(ground[..., 0], ground[..., 1])] = Label.SOLID
@@ -700,6 +702,18 @@ def test_a_pointed_end_of_the_mask_is_no_nozzle():
     # 0.4 of the typical width of 1.6 m is reached at x = 1.28 m, but only 15 % of the length may be given up
     assert start == pytest.approx(0.9, abs=0.1)
     assert stop == pytest.approx(6.0, abs=0.15)
+
+
+def test_a_channel_does_not_go_on_over_ground_that_is_seen_dry_far_from_its_mask():
+    """A dam across a river at a slant, in the middle of the picture: the river begins below it."""
+    slanted = channel(rock=False, ends=lambda x, y: (x < -0.7 + 0.5 * y) & (np.abs(y) < WIDTH / 2))
+    x, y = columns(slanted)
+    h, inside = slanted.grid.spacing, np.abs(y) < WIDTH / 2 - 2 * slanted.grid.spacing
+    wet = np.isin(slanted.cells, (CellType.FLUID, CellType.INFLOW)).any(axis=2)
+    leaves = (slanted.cells == CellType.OUTFLOW).any(axis=2)
+    behind = inside & (x < -0.7 + 0.5 * y - 0.3)
+    assert behind.sum() > 20 and not wet[behind].any()
+    assert (wet | leaves)[inside & (x > -0.7 + 0.5 * y + 2 * h)].mean() > 0.95
 
 
 def test_a_ragged_curtain_is_fed_along_its_whole_edge():

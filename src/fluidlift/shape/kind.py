@@ -56,6 +56,10 @@ RIM = 0.01
 """of the same: what is nearer to the outline of the fluid has the change of the outline in it"""
 STILL = 0.2
 """grey levels per px: gradients of a pattern that count as none"""
+WIDER, THREADS = 1.1, 0.02
+"""log of width below over width above that counts in full: three times as wide (a plume widens on its way up, as it
+takes in air: of 12 looks at three none is wider below by over 0.02; pools below jets are by 0.4 to 2.2); and share of a
+fluid at either end that is no part of its shape"""
 DRAWN_OUT = 1.0
 """`drawn_down` that says all it can. Seas, rivers and brooks seen at a slant have -2.5 to -0.5, streams and vessels
 seen from above -0.8 to 0.3, smoke -0.3 to 0.7, falls, jets and fountains -0.6 to 1.2 (34 real clips, half of the falls
@@ -172,7 +176,7 @@ def terms(f: dict[str, float], pitch: float | None) -> dict[str, float]:
     held = vessel * inside * (1.0 - f["falling"]) * (1.0 - f["vessel filled by a jet"])
     staying = max(f["swinging"], inside * f["circling"], lies * f["returning"], f["horizon"], f["bay"], held)
     plain = ("rising", "sideways", "falling", "followed", "wide", "bulky", "hanging", "changing", "grey",
-             "foreground", "thrown", "contained", "collapsing", "drawn across", "drawn down",
+             "foreground", "thrown", "contained", "collapsing", "drawn across", "drawn down", "wider below",
              "vessel filled by a jet")  # fmt: skip
     return (
         {"always": 1.0}
@@ -206,6 +210,16 @@ def terms(f: dict[str, float], pitch: float | None) -> dict[str, float]:
             "seen from above": 0.0 if pitch is None else float(np.clip((pitch - 20.0) / 20.0, -1.0, 1.0)),
         }
     )
+
+
+def _widening(region: Bool[np.ndarray, "h w"]) -> float:
+    """Logarithm of the median width of a region's lower third over that of its upper third, by height; its threads
+    above and below, of `THREADS` of it, are left out."""
+    width = region.sum(axis=1)
+    share = np.cumsum(width) / max(int(width.sum()), 1)
+    rows = width[(share >= THREADS) & (share - width / max(int(width.sum()), 1) <= 1.0 - THREADS) & (width > 0)]
+    third = len(rows) // 3
+    return float(np.log(np.median(rows[-third:]) / np.median(rows[:third]))) if third > 1 else 0.0
 
 
 def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
@@ -248,6 +262,7 @@ def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
         "bulky": float(np.clip((np.median(union.sum(axis=1)[union.any(axis=1)]) / width - 0.3) / 0.3, 0.0, 1.0)),
         "foreground": foreground,
         "ground": ground,
+        "wider below": float(np.clip(_widening(union) / WIDER, 0.0, 1.0)),
         "hanging": float(fluid[:, : max(2, height // 60)].any(axis=(1, 2)).mean() * (1 - ground)),
         "changing": float(np.clip(change / 0.3, 0.0, 1.0)),
         "circling": circling(displacement, weight),

@@ -22,6 +22,9 @@ COARSE = 96
 TAIL = 0.05
 """of the width: what is thinner than twice this is a tail of the mask, not a part of the stream"""
 
+AWAY = 0.04
+"""of the longer side of the picture: masks end nearer than that to what they should cover"""
+
 AT_HORIZON = 2
 """px from the horizon's line to the outline of what ends there: that of a mask is a pixel or two inside"""
 
@@ -236,6 +239,7 @@ def plan_of(seen: PlanEvidence, grid: Grid, extent: Extent | None = None) -> Pla
         start, stop = wide_ends(known & (label != Label.BACKGROUND), s, reach, grid.spacing, share=0.8)
         start, stop = max(start, reach[0] + 3 * grid.spacing), min(stop, reach[1] - 3 * grid.spacing)
         source = known & (s >= min(start, stop)) & (s <= max(start, stop))
+        source |= known & _far_from_fluid(seen.labels)[row, col]
     if seen.goes_on:
         label = _continued(label, known, grid, seen.along, across=1.0)
     elif not seen.closed:
@@ -246,6 +250,12 @@ def plan_of(seen: PlanEvidence, grid: Grid, extent: Extent | None = None) -> Pla
             label = _without_corners(label, source)
     label[beyond] = Label.BACKGROUND
     return Plan(label, level, s, speed, known, beyond)
+
+
+def _far_from_fluid(labels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels that show no fluid, and none within `AWAY` of them: it is dry there, wherever a channel may go on."""
+    away = np.asarray(ndimage.distance_transform_edt(labels == Label.BACKGROUND))
+    return away > AWAY * max(labels.shape)
 
 
 def dry_columns(seen: PlanEvidence, plan: Plan, grid: Grid) -> Bool[np.ndarray, "nx ny"]:

@@ -59,6 +59,20 @@ def test_seen_ground_has_the_colours_of_the_picture_and_cut_sides_those_of_earth
     assert np.ptp(colours[~top], axis=0).max() == 0
 
 
+@pytest.mark.parametrize(("pitch", "kept"), [(4.0, 0.0), (30.0, 1.0)])
+def test_what_stands_behind_ground_that_is_seen_flatly_is_not_drawn_over_it(pitch, kept):
+    way = 6.0 * np.array([0.0, -np.cos(np.radians(pitch)), np.sin(np.radians(pitch))])
+    camera = PinholeCamera.looking(tuple(way), (0.0, 0.0, 0.0), 40.0, (80, 80))
+    plate = np.zeros((80, 80, 3), np.uint8)
+    plate[:, :40], plate[:, 40:] = (200, 40, 40), (40, 40, 200)
+    mesh = ground_mesh(GRID, np.zeros((13, 9)))
+    colours = ground_colours(mesh, plate, camera)
+    top, x = mesh.vertices[:, 2] > -1e-6, mesh.vertices[:, 0]
+    left, right = (colours[top & side].mean(axis=0) for side in (x < -0.3, x > 0.3))
+    assert left[0] - right[0] == pytest.approx(kept * 160 / 255, abs=0.1)
+    assert colours[top, 0].mean() == pytest.approx(0.5, abs=0.15)  # evened out, and not gone
+
+
 def test_a_cut_is_of_neutral_earth_under_ground_of_any_colour():
     for top in ([0.1, 0.5, 0.1], [0.02, 0.02, 0.02], [0.95, 0.95, 0.95]):
         cut, own = linear_from_srgb(cut_colour(np.tile(top, (5, 1)))), linear_from_srgb(np.array(top))

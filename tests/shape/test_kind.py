@@ -83,6 +83,16 @@ def test_what_hangs_from_above_is_no_pour_where_all_of_it_goes_up(rising):
     assert (scores["pour"] < scores["plume"]) == (rising == 1.0), scores
 
 
+def test_what_is_wider_below_is_no_smoke_though_bubbles_rise_in_it():
+    """Water in a glass below its jet, and the same upside down: smoke from a stick that widens on its way up."""
+    glass = (np.abs(COL - 80) < np.where(ROW < 50, 6, 24)) & (ROW < 84)
+    below, above = (estimate_kind(*scene(m, (0.0, -3.0), GREY)) for m in (glass, (glass & (ROW > 6))[::-1]))
+    assert below.features["wider below"] == 1.0
+    assert above.features["wider below"] == 0.0
+    assert above.kind == "plume"
+    assert below.scores["plume"] < 0.5 * above.scores["plume"]
+
+
 @pytest.mark.parametrize("top", [0, 20])
 def test_what_is_wide_is_no_stream_where_all_of_it_goes_up_and_out_at_the_top(top):
     """Steam over a cup, in warm light; water that recedes does so below the sky and the far bank."""

@@ -19,6 +19,11 @@ LOAM = np.array([0.28, 0.24, 0.20])
 OWN = 0.5
 """share of the ground's own colour in a cut through it: below turf or snow there is earth"""
 
+GRAZING = (0.1, 0.3)
+"""sine of the angle at which ground is seen, below which the picture says nothing of it and above which it is believed
+(6 and 17 degrees: a pixel is drawn out to ten and to three times its width). What is seen so flatly is mostly what
+stands behind it or before it, drawn into streaks"""
+
 
 def cut_colour(ground: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
     """sRGB in [0, 1] of a cut through ground whose top has these colours (sRGB): half their median, half dry loam, in
@@ -47,8 +52,9 @@ def ground_colours(
 ) -> Float[np.ndarray, "v 3"]:
     """sRGB in [0, 1] of each vertex of a terrain.
 
-    What the picture shows gets its colour from there. Ground beyond the picture goes on as the seen ground beside it,
-    evened out: the last pixel would be drawn into long streaks. The cut sides and the floor show plain earth.
+    What the picture shows gets its colour from there, less the more flatly it is seen (`GRAZING`): then it has the
+    mean of what is shown in its place. Ground beyond the picture goes on as the seen ground beside it, evened out: the
+    last pixel would be drawn into long streaks. The cut sides and the floor show plain earth.
 
     Args:
         mesh: of the terrain, world.
@@ -68,6 +74,13 @@ def ground_colours(
     if not known.any():
         return colours
     colours[cut] = cut_colour(colours[known])
+    plain = known & ~read.stands & _looks_up(mesh)
+    way = camera.position - vertices[plain]
+    steep = np.abs(way[:, 2]) / np.maximum(np.linalg.norm(way, axis=1), 1e-12)
+    believed = np.clip((steep - GRAZING[0]) / (GRAZING[1] - GRAZING[0]), 0.0, 1.0)[:, None]
+    if plain.any():
+        mean = srgb_from_linear(linear_from_srgb(colours[plain]).mean(axis=0))
+        colours[plain] = believed * colours[plain] + (1.0 - believed) * mean
     hidden = ~seen & ~cut
     lies = known & ~read.stands if (known & ~read.stands).any() else known
     if hidden.any():
@@ -76,14 +89,19 @@ def ground_colours(
     return colours
 
 
-def _cut_vertices(mesh: TriangleMesh) -> np.ndarray:
-    """bool [v]: on the sides of the mesh's box or its floor, and on no face that looks up."""
+def _looks_up(mesh: TriangleMesh) -> np.ndarray:
+    """bool [v]: on a face that looks up."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
     normal = np.cross(b - a, c - a)
     up = normal[:, 2] > 0.2 * np.linalg.norm(normal, axis=1)
     top = np.zeros(len(mesh.vertices), bool)
     top[mesh.faces[up].ravel()] = True
+    return top
+
+
+def _cut_vertices(mesh: TriangleMesh) -> np.ndarray:
+    """bool [v]: on the sides of the mesh's box or its floor, and on no face that looks up."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     near = 1e-3 * float((high - low).max())
     side = (np.abs(mesh.vertices - low) < near).any(axis=1) | (np.abs(mesh.vertices - high) < near)[:, :2].any(axis=1)
-    return side & ~top
+    return side & ~_looks_up(mesh)

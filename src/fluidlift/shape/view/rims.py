@@ -163,7 +163,7 @@ def _arcs(edges: Bool[np.ndarray, "h w"], slope: Float[np.ndarray, "h w 2"]) -> 
                 continue
             for part in _one_way(bend, piece):
                 arc = line[part[0] : part[-1] + 2 * REACH + 1]
-                turned = abs(np.degrees(angle[part[-1] + REACH] - angle[part[0]]))
+                turned = abs(float(np.degrees(angle[part[-1] + REACH] - angle[part[0]])))
                 if len(arc) >= shortest and turned > LEAST_TURN:
                     arcs.append(_Arc(arc + 0.5, turned))
     return sorted(arcs, key=lambda a: len(a.points), reverse=True)

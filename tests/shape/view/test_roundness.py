@@ -116,6 +116,13 @@ def test_a_pool_that_the_picture_cuts_or_that_leans_is_not_taken_for_a_circle():
     assert round_pool((np.abs(COL - 160) < 90) & (np.abs(ROW - 120) < 40)) is None  # a rectangle
 
 
+def test_what_is_taller_than_wide_is_no_level_circle():
+    """What a glass holds, seen from the side, with its corners rounded."""
+    tall, flat = (((COL - 160) / 60) ** 2 + ((ROW - 120) / half) ** 2 < 1 for half in (67, 58))
+    assert round_pool(tall) is None
+    assert round_pool(flat) is not None
+
+
 @pytest.mark.parametrize("pitch", [25.0, 40.0])
 def test_the_pool_below_a_jet_is_what_is_wide(pitch):
     pool, jet = disc(pitch), (np.abs(COL - 150) < 8) & (ROW < 120)

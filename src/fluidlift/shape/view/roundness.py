@@ -33,6 +33,9 @@ LEVEL = 20.0
 hold a camera off it, and a lens's distortion"""
 NEARLY_ROUND = 0.85
 """width over length from which an ellipse has no longer axis"""
+TALLEST = 1.05
+"""height over width of a pool, at most: a level circle is as tall as it is wide from straight above, and nowhere
+taller; outlines err by a twentieth (a choice). What a glass holds is, from the side (1.12 to 1.36 as it fills)"""
 NOT_ROUND = 0.25
 """prior probability that what looks like an ellipse is none of a level circle: a lid on edge, a bent wire, a lake"""
 SHAPES = 11.0
@@ -120,7 +123,7 @@ def round_pool(lying: Bool[np.ndarray, "h w"], likeness: float = POOL_LIKENESS) 
     """
     edges = np.concatenate([lying[0], lying[-1], lying[:, 0], lying[:, -1]])
     pool = fit_ellipse(lying)
-    if pool is None or pool.likeness < likeness or edges.mean() > CUT or not pool.lies:
+    if pool is None or pool.likeness < likeness or edges.mean() > CUT or not pool.lies or pool.flatness > TALLEST:
         return None
     return pool
 

@@ -216,8 +216,9 @@ def _widening(region: Bool[np.ndarray, "h w"]) -> float:
     """Logarithm of the median width of a region's lower third over that of its upper third, by height; its threads
     above and below, of `THREADS` of it, are left out."""
     width = region.sum(axis=1)
-    share = np.cumsum(width) / max(int(width.sum()), 1)
-    rows = width[(share >= THREADS) & (share - width / max(int(width.sum()), 1) <= 1.0 - THREADS) & (width > 0)]
+    total = max(int(width.sum()), 1)
+    share = np.cumsum(width) / total
+    rows = width[(share >= THREADS) & (share - width / total <= 1.0 - THREADS) & (width > 0)]
     third = len(rows) // 3
     return float(np.log(np.median(rows[-third:]) / np.median(rows[:third]))) if third > 1 else 0.0
 

@@ -23,7 +23,8 @@ TAIL = 0.05
 """of the width: what is thinner than twice this is a tail of the mask, not a part of the stream"""
 
 AWAY = 0.04
-"""of the longer side of the picture: masks end nearer than that to what they should cover"""
+"""of the longer side of the picture: the ends of masks are taken to be nearer than that to where the fluid ends (a
+choice: four times what masks err by that are drawn by hand)"""
 
 AT_HORIZON = 2
 """px from the horizon's line to the outline of what ends there: that of a mask is a pixel or two inside"""

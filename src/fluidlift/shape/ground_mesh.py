@@ -69,12 +69,13 @@ def ground_colours(
     row, col, _ = camera.nearest_pixels(read.places)
     colours = plate[row, col].astype(np.float32) / 255.0
     seen = (depth > 0) & (uv >= 0).all(axis=-1) & (uv < np.array(camera.size)).all(axis=-1) & ~read.covered
-    cut = _cut_vertices(mesh)
+    top = _looks_up(mesh)
+    cut = _on_box(mesh) & ~top
     known = seen & ~cut
     if not known.any():
         return colours
     colours[cut] = cut_colour(colours[known])
-    plain = known & ~read.stands & _looks_up(mesh)
+    plain = known & ~read.stands & top
     way = camera.position - vertices[plain]
     steep = np.abs(way[:, 2]) / np.maximum(np.linalg.norm(way, axis=1), 1e-12)
     believed = np.clip((steep - GRAZING[0]) / (GRAZING[1] - GRAZING[0]), 0.0, 1.0)[:, None]
@@ -99,9 +100,9 @@ def _looks_up(mesh: TriangleMesh) -> np.ndarray:
     return top
 
 
-def _cut_vertices(mesh: TriangleMesh) -> np.ndarray:
-    """bool [v]: on the sides of the mesh's box or its floor, and on no face that looks up."""
+def _on_box(mesh: TriangleMesh) -> np.ndarray:
+    """bool [v]: on the sides of the mesh's box or its floor."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     near = 1e-3 * float((high - low).max())
     side = (np.abs(mesh.vertices - low) < near).any(axis=1) | (np.abs(mesh.vertices - high) < near)[:, :2].any(axis=1)
-    return side & ~_looks_up(mesh)
+    return side

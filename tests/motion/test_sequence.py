@@ -16,6 +16,7 @@ from fluidlift.motion.sequence import (
     FrameMotion,
     MotionOptions,
     MotionScene,
+    mean_velocity,
     motion_sequence,
     screen_downhill,
 )
@@ -107,6 +108,32 @@ def test_a_uniform_stream_has_its_speed_on_the_screen_on_the_surface_and_below()
     # the top cells; 10 % for what the bed's layer and the projection take
     assert inside[..., 0].mean() == pytest.approx(SPEED[0], rel=0.1)
     assert found.report.solve.converged
+
+
+def test_the_mean_of_a_clip_is_nearer_to_a_steady_stream_than_that_of_frames_in_a_row() -> None:
+    """Eddies that are as large in eight frames in a row as in one, and gone in the mean of the clip."""
+    fluid, depth = still_mask(0), level_depth()
+    u = CAMERA.pixel_grid()[..., :1]
+    eddies = 0.4 * np.sin(2 * np.pi * u / 20.0).astype(np.float32) * flow_of(SPEED, depth)
+
+    class Eddies(Clip):
+        def __call__(self, first: int, last: int) -> PixelFlow:
+            flow = super().__call__(first, last)
+            return PixelFlow(flow.displacement + eddies, flow.confidence)
+
+    clip = Clip(9)
+    scene = channel(prior=(clip.truth, np.full(fluid.shape, 0.9, np.float32)))
+    in_a_row = motion_sequence(Eddies(9), still_mask, 9, channel(), frames=(), volume_frames=range(8))
+    eight = np.mean([f.velocity.at_centers() for f in in_a_row if f.velocity is not None], axis=0)
+    mean = mean_velocity(fluid, scene)
+    assert mean is not None
+    top = (slice(3, -3), slice(3, -3), 3)
+    off_eight, off = (np.abs(v[top][..., 0] - SPEED[0]).mean() for v in (eight, mean.at_centers()))
+    assert off < 0.5 * off_eight
+    assert off < 0.1 * SPEED[0]
+    assert mean_velocity(np.zeros_like(fluid), scene) is None
+    with pytest.raises(ValueError, match="mean motion"):
+        mean_velocity(fluid, channel())
 
 
 def test_waves_that_pass_over_standing_water_are_no_motion_of_it() -> None:

@@ -15,7 +15,7 @@ from fluidlift.numerics.sampling import sample_faces
 from fluidlift.physics import guidance
 from fluidlift.physics.guidance import Nudging
 from fluidlift.physics.inflow_schedule import InflowSchedule
-from fluidlift.pipeline.stages.calibrate import GAIN, STRONG, calibrate
+from fluidlift.pipeline.stages.calibrate import GAIN, STRONG, calibrate, mean_target
 from fluidlift.scene.build import SceneSettings, SimulationRequest, scene_of
 from fluidlift.scene.coarse_copy import coarser
 from fluidlift.scene.force_weight import following
@@ -67,6 +67,24 @@ def test_a_target_that_contradicts_shape_and_mass_is_said(channel):
     found = calibrate(scene, against)
     assert found.left > STRONG
     assert "flow-not-held" in map(code_of, found.warnings)
+
+
+def test_the_target_is_the_mean_of_all_frames_and_other_stretches_count_by_theirs(channel):
+    scene = channel(2)
+    grid, asset = scene.terrain.grid, SimpleNamespace(cell_types=scene.cell_types)
+    targets = [uniform(grid, (1.0, 0.0, 0.0)), uniform(grid, (3.0, 0.0, 0.0))]
+    motion = SimpleNamespace(velocities=targets, mean=None, completed=np.zeros((30, 1, 1, 2)))
+    liquid = scene.cell_types == CellType.FLUID
+
+    def along(*given) -> float:
+        return float(mean_target(asset, *given).at_centers()[liquid][:, 0].mean())
+
+    assert along(motion) == pytest.approx(2.0)
+    whole = SimpleNamespace(velocities=targets, mean=uniform(grid, (1.0, 0.0, 0.0)), completed=motion.completed)
+    assert along(whole) == pytest.approx(1.0)
+    other = SimpleNamespace(velocities=[[uniform(grid, (5.0, 0.0, 0.0))] * 2])
+    assert along(motion, other) == pytest.approx(3.5)
+    assert along(whole, other) == pytest.approx((30 * 1.0 + 2 * 5.0) / 32)
 
 
 def test_smoke_and_pours_are_not_calibrated(channel):

@@ -182,6 +182,40 @@ def motion_sequence(
     return _sequence(flow, mask, pairs, scene, options, wanted, volumes)
 
 
+def mean_velocity(
+    mask: Bool[np.ndarray, "h w"], scene: MotionScene, options: MotionOptions = MotionOptions()
+) -> FaceVelocity | None:
+    """Volume velocity of the clip's mean motion (`MotionScene.prior`), m/s: what a steady flow does at all times.
+
+    The mean of a whole clip is known better than that of a few frames in a row, in which eddies and waves that pass
+    are as large as they are: of a simulated river the mean of eight frames is off by 0.97 px, of 47 by 0.50.
+
+    Args:
+        mask: the fluid.
+        scene: with a prior, one depth for all frames, terrain and cell types.
+        options: see `MotionOptions`; nothing holds what was filled in against the divergence on the screen.
+
+    Returns:
+        on the faces; None where no fluid lies on the body.
+
+    Raises:
+        ValueError: a scene that lacks one of these.
+    """
+    ready = scene.prior is not None and scene.terrain is not None and scene.cell_types is not None
+    require(ready and scene.depth is not None and not callable(scene.depth), "a scene without mean motion and geometry",
+            "prior, one depth, terrain and cell types")  # fmt: skip
+    assert scene.prior is not None
+    depth = scene.depth_at(0)
+    body = np.asarray(mask, bool) & (depth > 0)
+    if not body.any():
+        return None
+    mean, trust = scene.prior
+    direction = mainstream_direction(mean, trust, body, downhill=screen_downhill(scene))
+    full, seen = complete_flow(mean, trust, body, direction, np.where(body, depth, 1.0))
+    now = _Instant(body, body, depth, depth)
+    return _lifted(full, seen, now, scene, options, _solver(scene, options))[2]
+
+
 def _sequence(
     flow: FlowReader, mask: MaskReader, pairs: int, scene: MotionScene, options: MotionOptions, wanted: list[int],
     volumes: frozenset[int],

@@ -116,7 +116,7 @@ def _lifted(
     geometry = begin.shape(runner, seen, given, config, hints)
     settings = taken(RefineSettings, config.shape, seed=config.seed)
     refined = runner.run("refine", refine, *seen, geometry, given.geometry, settings)
-    moving = runner.run("motion", motion, *seen, geometry, MotionSettings.of(config, guide=True))
+    moving = runner.run("motion", motion, *seen, geometry, MotionSettings.of(config, simulated=True))
     more = moved_elsewhere(runner, files, others, (read, segmentation, geometry, moving))
     also = () if more is None else (more,)
     fitted = runner.run("fit", fit, read, segmentation, geometry, moving, config.fit, *also)
@@ -184,8 +184,7 @@ def _calibrated(runner: Runner, lift: Lift, asset: FluidAsset, config: JobConfig
     from fluidlift.io.scene import SceneEdits
 
     scene = edited_scene(asset, SceneEdits(), None, SceneSettings.of(config), start=lift.geometry.rest_frame)
-    also = [] if lift.elsewhere is None else [v for stretch in lift.elsewhere.velocities for v in stretch]
-    target = mean_target(asset, [*lift.motion.velocities, *also])
+    target = mean_target(asset, lift.motion, lift.elsewhere)
     masks, s = FluidMasks(lift.labels.labels, lift.geometry.hidden), config.simulate
     left = (len(masks) - lift.geometry.rest_frame) * asset.interval
     shares, dry_for = filmed_shares(kind_of(asset.kind), masks, left)

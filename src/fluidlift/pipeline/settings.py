@@ -314,11 +314,16 @@ class MotionSettings:
     complete_every: int
     every_frame: bool
     """whether the volume velocity of all frames is wanted, to guide a simulation"""
+    of_whole: bool
+    """whether the volume velocity of the mean motion is wanted, for the force that keeps it"""
 
     @classmethod
-    def of(cls, config: JobConfig, *, guide: bool = False) -> MotionSettings:
-        """From those of a job; `guide` asks for the velocities that a guided simulation needs, where it wants them."""
-        return taken(cls, config.motion, every_frame=guide and config.simulate.guide > 0)
+    def of(cls, config: JobConfig, *, simulated: bool = False) -> MotionSettings:
+        """From those of a job; `simulated` asks for the velocities that a simulation needs, where it wants them."""
+        wanted = config.simulate
+        return taken(
+            cls, config.motion, every_frame=simulated and wanted.guide > 0, of_whole=simulated and wanted.follow > 0
+        )
 
 
 @dataclass(frozen=True)

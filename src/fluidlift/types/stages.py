@@ -284,6 +284,8 @@ class Motion:
     """of the steep part, whose speed is that of free fall, at most"""
     filmed: FilmedMotion | None = None
     """of all frames, continued into air and walls, to guide a simulation; None: not asked for"""
+    mean: FaceVelocity | None = None
+    """m/s, of the mean motion of all frames; None: not asked for, or nothing lasts in this kind of fluid"""
     warnings: tuple[Notice, ...] = ()
 
     def __post_init__(self) -> None:

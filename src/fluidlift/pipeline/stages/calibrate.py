@@ -20,7 +20,7 @@ from fluidlift.pipeline.work import Work
 from fluidlift.scene.build import Scene
 from fluidlift.scene.force_weight import pull_rate
 from fluidlift.types import CellType, FaceVelocity, kind_of
-from fluidlift.types.stages import Calibration
+from fluidlift.types.stages import Calibration, Elsewhere, Motion
 
 if TYPE_CHECKING:
     from fluidlift.types import FluidAsset
@@ -51,13 +51,27 @@ SLOW = 0.2
 """of the speed of a wave: in slower flows the sloshing of the start is larger than the flow, and is no contradiction"""
 
 
-def mean_target(asset: FluidAsset, targets: Sequence[FaceVelocity]) -> FaceVelocity:
-    """Mean of the filmed velocities (m/s), continued from the liquid into air and walls."""
+def mean_target(asset: FluidAsset, motion: Motion, elsewhere: Elsewhere | None = None) -> FaceVelocity:
+    """Mean of the filmed velocities (m/s), continued from the liquid into air and walls.
+
+    Of the part that is made that of all its frames, where it is known, and else of its targets; of other stretches
+    that of their targets. Each counts by its frames.
+    """
     from fluidlift.physics.boundaries import continued
 
-    components = zip(*(t.components for t in targets), strict=True)
-    mean = FaceVelocity(*(np.asarray(np.mean(c, axis=0, dtype=np.float32)) for c in components))
+    stretches = [] if elsewhere is None else elsewhere.velocities
+    means = [_mean(targets) for targets in (motion.velocities, *stretches)]
+    frames = [len(targets) for targets in (motion.velocities, *stretches)]
+    if motion.mean is not None:
+        means[0], frames[0] = motion.mean, len(motion.completed)
+    components = zip(*(m.components for m in means), strict=True)
+    mean = FaceVelocity(*(np.average(c, axis=0, weights=frames).astype(np.float32) for c in components))
     return continued(mean, asset.cell_types)
+
+
+def _mean(targets: Sequence[FaceVelocity]) -> FaceVelocity:
+    components = zip(*(t.components for t in targets), strict=True)
+    return FaceVelocity(*(np.asarray(np.mean(c, axis=0, dtype=np.float32)) for c in components))
 
 
 def calibrate(

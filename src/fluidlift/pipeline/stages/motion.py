@@ -25,7 +25,7 @@ from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Flow, Geometry, Motion, Read, Segmentation, TargetVelocity
 
 if TYPE_CHECKING:
-    from fluidlift.motion.sequence import FrameMotion
+    from fluidlift.motion.sequence import FrameMotion, MotionOptions, MotionScene
 
 
 def motion(
@@ -82,8 +82,22 @@ def motion(
         front_factor=float(np.median(factors)) if factors else 1.0,
         free_fall_share=fast,
         filmed=_film_of(filmed, film, start, clip.interval),
+        mean=_mean_velocity(masks[start], geometry, scene, options) if config.of_whole else None,
         warnings=tuple(motion_warnings([t.plain() for t in found], geometry.kind, fast)),
     )
+
+
+def _mean_velocity(
+    mask: np.ndarray, geometry: Geometry, scene: MotionScene, options: MotionOptions
+) -> FaceVelocity | None:
+    """Of what the fluid does all the time, m/s; None of a kind whose motion does not last."""
+    from fluidlift.motion.sequence import mean_velocity
+
+    kind = kind_of(geometry.kind)
+    if not (kind.is_channel_flow and kind.has_mean_motion):
+        return None
+    found = mean_velocity(mask, scene, options)
+    return None if found is None else FaceVelocity(*(c.astype(np.float32) for c in found.components))
 
 
 def _frames_of_film(geometry: Geometry, pairs: int) -> range:

@@ -2,11 +2,13 @@
 
 import io
 import sys
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
+import tyro
 
-from fluidlift.cli import FAILED, REJECTED, USAGE, main
+from fluidlift.cli import FAILED, REJECTED, USAGE, Command, main
 from fluidlift.cli.options import Make
 from fluidlift.scene.splat_files import frames_told
 
@@ -30,6 +32,17 @@ def test_help_does_not_offer_none(command, capsys):
     code, said = shown(capsys, command, "--help")
     assert code == 0
     assert "None" not in said and "(default: )" not in said and "default: not given" not in said
+
+
+@pytest.mark.parametrize("command", sorted(get_args(Command), key=lambda c: c.__name__), ids=lambda c: c.__name__)
+def test_help_tells_what_stands_without_an_option(command, capsys):
+    """A sign such as | in its placeholder takes it out of the help without a word."""
+    (mark,) = tyro.conf.Positional[int].__metadata__
+    hints = get_type_hints(command, include_extras=True).values()
+    bare = any(mark in getattr(hint, "__metadata__", ()) for hint in hints)
+    _, said = shown(capsys, command.__name__.lower(), "--help")
+    assert ("positional arguments" in said) == bare
+    assert "default: True" not in said
 
 
 def test_learned_models_are_asked_for_alike_wherever_a_clip_is_looked_at(capsys):

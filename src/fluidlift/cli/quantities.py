@@ -50,7 +50,7 @@ Folder = Annotated[
 ]  # fmt: skip
 """such as assets/ or s3://bucket/assets"""
 
-_NO_DEFAULTS = ("not given", "False", "")
+_NO_DEFAULTS = ("not given", "False", "True", "")
 HINT = tyro.conf.arg(help_behavior_hint=lambda label: "" if label in _NO_DEFAULTS else f"(default: {label})")
 """The help names a default only where there is one: an option that may be left out says by its text what then is."""
 

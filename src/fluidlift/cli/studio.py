@@ -16,8 +16,8 @@ from fluidlift.cli.quantities import command
 class Studio:
     """See in the browser what is found of a clip, put it right with a few strokes, and make it."""
 
-    place: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLIP|FOLDER")] = Path(".")
-    """a video, or a folder of videos and assets; by default the current folder"""
+    place: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PLACE")] = Path(".")
+    """a video, or a folder of videos and assets"""
     port: int = 8180
     """of the page; the next free one where it is in use"""
     browser: bool = True

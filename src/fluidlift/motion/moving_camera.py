@@ -177,28 +177,27 @@ def walked(
     except MissingPackage:
         return None, Notice(
             "camera-extra-missing",
-            "the camera goes somewhere, and what is near moves before what is far: pip install 'fluidlift[camera]' "
-            "would find its path, and lay the clip so that banks and trees stand still, and the water as before a "
-            "tripod",
+            "the camera changes its place, so what is near moves against what is far: pip install 'fluidlift[camera]' "
+            "would find its path, and show banks, trees and water as from a tripod",
         )
     found, why = _believed(grey, path)
     if found is not None and gain(grey, grey if steady is None else steady, found) < GAIN:
-        found, why = None, "what moves may be things, for along its path no more of the picture stands still"
+        found, why = None, "no more of the picture stands still along the path that was found: things may move instead"
     if found is not None:
         return found, None
     return None, Notice(
         "camera-path-unknown",
-        f"the camera goes somewhere, and {why}: its motion is taken out as if it only turned, and what is near still "
-        "moves; a stretch in which it stands (--start, --duration), or a --mask, would help",
+        f"the camera seems to change its place, but {why}. Its motion is taken out as if it only turned, so what is "
+        "near may still move; a stretch in which it stands (--start, --duration), or a --mask, would help",
     )
 
 
 def _believed(grey: Sequence[np.ndarray], path: CameraPath | None) -> tuple[Walked | None, str]:
     """The walk, or why not."""
     if path is None:
-        return None, "what stands does not agree on one path"
+        return None, "what stands still does not agree on one path"
     if path.error_px > CLOSE_FIT:
-        return None, f"its path fits what stands to {path.error_px:.1f} px only"
+        return None, f"the path that was found fits what stands still to {path.error_px:.1f} px only"
     reference = len(grey) // 2
     path = path.from_frame(reference)
     swept = sweep(grey, path, reference)

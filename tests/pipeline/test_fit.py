@@ -57,8 +57,8 @@ def body(kind, cells=None):
 def guess():
     """`first_guess` of a body with these cells."""
 
-    def find(targets, *, kind="stream", cells=None, filling=None):
-        return stage.first_guess(body(kind, cells), targets, INTERVAL, filling)
+    def find(targets, *, kind="stream", cells=None, filling=None, **more):
+        return stage.first_guess(body(kind, cells), targets, INTERVAL, filling, **more)
 
     return find
 
@@ -78,6 +78,25 @@ def test_the_fluctuation_is_that_of_the_inlet_over_the_frames(guess):
     assert found.inflow_velocity[0] == pytest.approx(1.0)
     # 0.1 along x and nothing along the others
     assert found.inflow_fluctuation == pytest.approx(0.1, rel=1e-4)
+
+
+def test_what_falls_freely_enters_as_steadily_as_jets_do(guess):
+    """Where a fall was seen to begin differs from frame to frame, and with it the speed that free fall gives it."""
+    targets = [flow(1.0), flow(2.0)]
+    assert guess(targets, kind="pour").inflow_fluctuation == pytest.approx(0.5)
+    assert guess(targets, kind="pour", falls=True).inflow_fluctuation == pytest.approx(stage.SCATTER * 1.5)
+    assert guess([flow(1.0)] * 2, kind="pour", falls=True).inflow_fluctuation == pytest.approx(0.0, abs=1e-6)
+    # of the jet as it was filmed, however slowly its vessel fills
+    slow = guess(targets, kind="pour", falls=True, filling=0.1 * GRID.spacing**2)
+    assert slow.inflow_fluctuation == pytest.approx(stage.SCATTER * 1.5)
+
+
+def test_a_fluctuation_does_not_make_up_for_a_discharge_that_is_less_than_what_was_filmed():
+    names = [stage.usually_fitted(falls=falls, fills=True) for falls in (False, True)]
+    assert not any({"inflow_velocity", "inflow_fluctuation"} & set(n) for n in names)
+    assert all("outflow_velocity" in n for n in names)
+    assert {"inflow_velocity", "inflow_fluctuation"} <= set(stage.usually_fitted(falls=True, fills=False))
+    assert "kinematic_viscosity" in stage.usually_fitted(falls=False, fills=False)
 
 
 def test_a_steady_profile_is_no_fluctuation():

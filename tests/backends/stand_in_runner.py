@@ -73,7 +73,9 @@ def misbehave(folder, what):
         os.kill(os.getpid(), signal.SIGKILL)
     if what == "hang":
         child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
-        Path(os.environ["STAND_IN_ASKED"]).with_suffix(".child").write_text(str(child.pid))
+        told = Path(os.environ["STAND_IN_ASKED"]).with_suffix(".child")
+        told.with_suffix(".part").write_text(str(child.pid))
+        told.with_suffix(".part").replace(told)  # who waits for the file finds the number in it
         time.sleep(600)
     if what == "nothing":
         (folder / "status.json").write_text(json.dumps({"protocol": 1, "state": "done"}))

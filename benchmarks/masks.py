@@ -37,6 +37,7 @@ from fluidlift.pipeline.settings import ReadSettings
 from fluidlift.pipeline.stages.read import read
 from fluidlift.pipeline.work import Work
 from fluidlift.shape.evidence import fluid_score, gather_evidence
+from fluidlift.shape.fluid_found import likely_overlap
 from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.moving_solids import SharedPairs, moving_solids
 from fluidlift.shape.open_water import field_around, lies_open, log_wander
@@ -309,6 +310,8 @@ def main() -> None:
         ious.append(iou)
         print(f"{subject.name:28} {iou:.3f} {seconds:5.1f} s", flush=True)
         records.append({"subject": subject.name, "figure": "IoU", "value": round(iou, 3)})
+        likely = likely_overlap(found.labels, found.confidence)
+        records.append({"subject": subject.name, "figure": "likely IoU", "value": round(likely, 3)})
         records.append({"subject": subject.name, "figure": "time", "value": round(seconds, 1)})
         if args.pixels is not None:
             pixels[subject.name] = sampled_pixels(ready, found)

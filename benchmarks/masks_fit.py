@@ -5,16 +5,23 @@ how far change is explained by motion that does not go on (`carried`), whether a
 it lies inside the outline that was found, and whether it is fluid. `python benchmarks/masks.py --pixels` makes it anew
 where the clips are there. Printed are the log odds per unit of `carried` above some thresholds, and the weights of
 `shape.segment.sureness` with a table of how often it is right, each clip predicted without itself.
+
+And how likely a mask is right, `shape.fluid_found.CHANCE`: of each real clip in `benchmarks/results/masks.json`,
+whether its mask overlaps what a person drew by `RIGHT`, by the overlap that its own confidence expects.
 """
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
 
 TABLE = Path(__file__).resolve().parent / "mask_pixels.npz"
+RESULTS = Path(__file__).resolve().parent / "results" / "masks.json"
+RIGHT = 0.7
+"""intersection over union with what a person drew, of a mask that is right"""
 THRESHOLDS = (0.2, 0.25, 0.3, 0.35, 0.4, 0.45)
 LOUDEST = 8.0
 """log odds: as in `shape.segment`"""
@@ -49,8 +56,27 @@ def log_loss(odds: np.ndarray, fluid: np.ndarray, clip: np.ndarray) -> float:
     return float(np.mean([each[clip == c].mean() for c in np.unique(clip)]))
 
 
+def whole_masks() -> None:
+    """Print how likely a mask is right."""
+    found: dict[str, dict[str, float]] = {}
+    for record in json.loads(RESULTS.read_text(encoding="utf-8"))["records"]:
+        found.setdefault(record["subject"], {})[record["figure"]] = record["value"]
+    both = [v for name, v in found.items() if name.startswith("clip ") and {"IoU", "likely IoU"} <= set(v)]
+    likely, right = np.array([[v["likely IoU"]] for v in both]), np.array([v["IoU"] >= RIGHT for v in both], float)
+    b, each, without = fitted(likely, right, np.ones(len(right))), np.arange(len(right)), np.zeros((len(right), 0))
+    odds = left_out(likely, right, each)
+    told, base = (log_loss(o, right, each) for o in (odds, left_out(without, right, each)))
+    print(f"masks: {len(right)} clips, {right.mean():.2f} right, log odds {b[0]:.2f} per unit, {b[1]:.2f}", end="")
+    print(f"; log loss, each clip left out, {told:.3f}, {base:.3f} without")
+    for low, high in ((-np.inf, 0.0), (0.0, np.log(4.0)), (np.log(4.0), np.inf)):
+        here = (odds >= low) & (odds < high)
+        mean = (1.0 / (1.0 + np.exp(-odds[here]))).mean()
+        print(f"  {int(here.sum())} clips: chance {mean:.2f}, right {right[here].mean():.2f}")
+
+
 def main() -> None:
-    """Print both fits."""
+    """Print all fits."""
+    whole_masks()
     with np.load(TABLE, allow_pickle=False) as table:
         names, clip = table["names"], table["clip"].astype(int)
         score, carried = table["score"].astype(float), table["carried"].astype(float)

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from fluidlift.evaluate.as_filmed import FEWEST, GOOD, USABLE, VERDICTS, WRONG, AsFilmed, Likeness, as_filmed
+from fluidlift.evaluate.as_filmed import (
+    FEWEST,
+    GOOD,
+    USABLE,
+    VERDICTS,
+    WRONG,
+    AsFilmed,
+    Likeness,
+    as_filmed,
+    with_certainty,
+)
 from fluidlift.evaluate.film import growth, mean_flow, mean_flows
 from fluidlift.motion.optical_flow import DenseInverseSearch
 
@@ -232,6 +242,21 @@ def test_the_verdict_is_the_worst_of_those_that_are_judged():
     assert AsFilmed(9, 0, (figures[1],)).verdict is None
     assert AsFilmed(9, 0, (figures[1],)).sentence().startswith("as filmed: not judged")
     assert VERDICTS[-1] == WRONG
+
+
+def test_what_is_rather_wrong_than_right_makes_no_asset_good():
+    card = AsFilmed(9, 0, (Likeness("level", "level", 0.99, verdict=GOOD),))
+    sure = with_certainty(card, {"mask": 0.9, "kind": 0.6})
+    assert sure.verdict == GOOD and sure.advice == () and sure["right_kind"].value == 0.6
+    assert sure.sentence() == "as filmed: good (level 0.99)"  # of what is well nothing more is said
+    doubted = with_certainty(card, {"mask": 0.3, "kind": 0.6, "tilt": 0.2})
+    assert doubted.verdict == USABLE and doubted.warning() is None
+    assert doubted.sentence().startswith("as filmed: usable (chance that the mask is right 0.30; chance that the tilt")
+    assert len(doubted.advice) == 2 and "--pitch" in doubted.advice[1]
+    bad = AsFilmed(9, 0, (Likeness("level", "level", 0.2, verdict=WRONG),))
+    assert with_certainty(bad, {"mask": 0.9}).verdict == WRONG
+    unmeasured = AsFilmed(9, 0, (Likeness("level", "level", None),))
+    assert with_certainty(unmeasured, {"mask": 0.9}).verdict is None  # nothing was held against the clip
 
 
 def filling(frames: int, first: float, last: float) -> np.ndarray:

@@ -311,7 +311,7 @@ def test_a_given_body_replaces_the_embedded_generator(made, tmp_path, hasty, ass
 
 
 def test_an_interrupted_job_goes_on_where_it_stopped(made, copy, quick, capsys, monkeypatch):
-    def stop(*inputs):
+    def stop(*inputs, **beside):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:

@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.io.asset_folder import read_manifest, update_manifest
 from fluidlift.physics.inflow_schedule import InflowSchedule
-from fluidlift.present.as_filmed import Reel, card_of, card_of_run, why_not
+from fluidlift.present.as_filmed import Reel, card_of, card_of_run, certainty, why_not
 from fluidlift.scene.footage import Footage
 from fluidlift.types import PixelLabels, VideoClip
 
@@ -45,7 +46,35 @@ def test_evaluate_prints_the_card_and_gives_it_as_json(made, capsys):
     said = capsys.readouterr().out
     assert "as filmed: " in said and "level" in said and "floor" in said
     assert main(["evaluate", str(made.folder), "--json"]) in WELL
-    assert json.loads(capsys.readouterr().out) == read_manifest(made.folder)["simulation"]["as_filmed"]
+    manifest, told = read_manifest(made.folder), json.loads(capsys.readouterr().out)
+    stored, certain = manifest["simulation"]["as_filmed"], manifest["metrics"]["certainty"]
+    assert set(certain) == {"mask", "kind", "tilt"}  # nobody gave them
+    assert certain["kind"] == pytest.approx(manifest["metrics"]["kind_scores"][manifest["kind"]], abs=1e-3)
+    assert {k: v for k, v in told["figures"].items() if not k.startswith("right_")} == stored["figures"]
+    assert {k: told["figures"][f"right_{k}"]["value"] for k in certain} == certain
+    assert (told["frames"], told["notes"]) == (stored["frames"], stored["notes"])
+
+
+def test_what_a_person_gave_is_certain_and_a_tilt_of_little_evidence_is_not():
+    def lift(*, source: str = "evidence", error: float = 6.0, drawn: bool = False):
+        evidence = SimpleNamespace(scores={"stream": 0.4, "pour": 0.35})
+        geometry = SimpleNamespace(
+            kind="stream", kind_source=source, kind_evidence=evidence, up=SimpleNamespace(error=error)
+        )
+        return SimpleNamespace(geometry=geometry, segmentation=SimpleNamespace(user_mask=drawn, likely_overlap=0.9))
+
+    found = certainty(lift())
+    assert found["kind"] == 0.4 and found["mask"] > 0.8
+    assert found["tilt"] == pytest.approx(0.8176, abs=1e-4)  # within 8 degrees, of a spread of 6
+    assert certainty(lift(error=20.0))["tilt"] < 0.35
+    assert certainty(lift(source="user", error=0.0, drawn=True)) == {}
+
+
+@pytest.mark.parametrize("wrong", [{"kind": "sure"}, ["kind"], 3, {"kind": None}])
+def test_a_manifest_whose_certainty_is_broken_is_told_and_not_raised(made, wrong):
+    manifest = read_manifest(made.folder)
+    found = card_of(manifest | {"metrics": manifest["metrics"] | {"certainty": wrong}})
+    assert isinstance(found, str) and "fluidlift sim" in found
 
 
 def test_evaluate_says_why_there_is_no_card_and_what_to_do(asset, capsys):

@@ -9,7 +9,7 @@ agrees with itself on it does not fail for being as unlike.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -137,7 +137,8 @@ class AsFilmed:
 
     def sentence(self) -> str:
         """Verdict and main figures in one line; what is worst comes first."""
-        judged = sorted((f for f in self.figures if f.verdict), key=lambda f: -VERDICTS.index(str(f.verdict)))
+        judged = [f for f in self.figures if f.verdict and not (f.key.startswith("right_") and f.verdict == GOOD)]
+        judged.sort(key=lambda f: -VERDICTS.index(str(f.verdict)))
         told = []
         for f in judged:
             later = f", {_text(f.beyond)} after the clip" if f.beyond is not None else ""
@@ -166,6 +167,33 @@ class AsFilmed:
         figures = tuple(Likeness(key, **entry) for key, entry in plain["figures"].items())
         notes, advice = tuple(plain["notes"]), tuple(plain["advice"])
         return AsFilmed(int(plain["frames"]), int(plain["beyond"]), figures, notes, advice)
+
+
+_CERTAIN = {
+    "mask": ("chance that the mask is right", "The mask is rather wrong than right: correct it (fluidlift mask)."),
+    "kind": ("chance that the kind is right", "The kind is rather wrong than right: give --kind."),
+    "tilt": ("chance that the tilt is right", "The tilt is rather wrong than right: give --pitch."),
+}
+"""what an asset is built from: words, and what to do where it is in doubt"""
+
+
+def with_certainty(card: AsFilmed, found: Mapping[str, float]) -> AsFilmed:
+    """The card with how likely it is that what the asset was built from is right.
+
+    A wrong mask or kind can be re-simulated as it was found: what is rather wrong than right makes no asset good.
+
+    Args:
+        card: without that.
+        found: probability of mask, kind and tilt, of those that nobody gave.
+    """
+    if card.verdict is None:
+        return card
+    told = [
+        Likeness(f"right_{key}", words, round(float(found[key]), 4), verdict=GOOD if found[key] >= 0.5 else USABLE)
+        for key, (words, _) in _CERTAIN.items() if key in found
+    ]  # fmt: skip
+    advice = [do for key, (_, do) in _CERTAIN.items() if found.get(key, 1.0) < 0.5]
+    return replace(card, figures=(*card.figures, *told), advice=(*card.advice, *advice))
 
 
 def _worst(figure: Likeness) -> float | None:

@@ -28,6 +28,7 @@ from fluidlift.pipeline.stages.calibrate import calibrate, mean_target
 from fluidlift.pipeline.stages.fit import fit
 from fluidlift.pipeline.stages.motion import motion
 from fluidlift.pipeline.stages.refine import refine
+from fluidlift.present.as_filmed import certainty
 from fluidlift.scene.build import SceneSettings, SimulationRequest, edited_scene, first_of_film
 from fluidlift.scene.filmed_cells import filmed_shares
 from fluidlift.scene.simulator import particle_work
@@ -216,6 +217,7 @@ def _metrics(lift: Lift, calibration: Calibration) -> dict[str, Any]:
     return {
         "kind_scores": g.kind_evidence.scores,
         "up": asdict(g.up),
+        "certainty": certainty(lift),
         "scale": asdict(g.scale) | {"sentence": g.scale_sentence},
         "rest_frame": g.rest_frame,
         **_times(lift),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,12 +16,17 @@ from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.scene.build import Scene
 from fluidlift.scene.footage import Footage
 from fluidlift.types import kind_of
+from fluidlift.types.stages import Lift
 
 if TYPE_CHECKING:
     from fluidlift.evaluate.as_filmed import AsFilmed
 
 BEYOND = 3
 """times the clip's length, up to which frames are held against it: they lie on disk meanwhile"""
+
+
+WORST_TILT = 8.0
+"""degrees that a tilt that is right is off at most: lengths along the view come out wrong by a third"""
 
 
 class Reel:
@@ -105,9 +111,23 @@ def card_of_run(
     return Noted(card.to_dict(), (warning,) if warning else ())
 
 
+def certainty(lift: Lift) -> dict[str, float]:
+    """How likely it is that mask, kind and tilt are right, of those that no person gave."""
+    from fluidlift.shape.fluid_found import chance_of_mask
+
+    g, found = lift.geometry, {}
+    if not lift.segmentation.user_mask:
+        found["mask"] = chance_of_mask(lift.segmentation.likely_overlap)
+    if g.kind_source != "user" and g.kind in g.kind_evidence.scores:
+        found["kind"] = g.kind_evidence.scores[g.kind]
+    if g.up.error > 0.0:
+        found["tilt"] = math.erf(WORST_TILT / (g.up.error * math.sqrt(2.0)))
+    return {key: round(value, 4) for key, value in found.items()}
+
+
 def card_of(manifest: Mapping[str, Any]) -> AsFilmed | str:
     """The card that a manifest holds, or why there is none and what to do."""
-    from fluidlift.evaluate.as_filmed import AsFilmed
+    from fluidlift.evaluate.as_filmed import AsFilmed, with_certainty
 
     stored = manifest.get("simulation", {}).get("as_filmed")
     if not isinstance(stored, dict):
@@ -115,6 +135,6 @@ def card_of(manifest: Mapping[str, Any]) -> AsFilmed | str:
     if "none" in stored:
         return str(stored["none"])
     try:
-        return AsFilmed.from_dict(stored)
+        return with_certainty(AsFilmed.from_dict(stored), manifest.get("metrics", {}).get("certainty", {}))
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
         return "what the manifest says of it cannot be read: run fluidlift sim --restart"

@@ -14,7 +14,7 @@ from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.look.clear_water import CHANNELS, NAME, absorption_in
 from fluidlift.look.report import Figure, Section, report_html
-from fluidlift.present.as_filmed import card_of
+from fluidlift.present.as_filmed import card_of, certainty
 from fluidlift.scene.filmed_numbers import NAMES
 from fluidlift.types import CellType, kind_of
 from fluidlift.types.stages import Fit, Geometry, Lift, Read, Refined, Shown, Simulation
@@ -49,7 +49,7 @@ def write_report(
     sure = np.clip(labels.confidence[start].astype(np.float32), 0.0, 1.0)
     write_png(asset_file(folder, "rest/mask_confidence.png"), (255 * sure + 0.5).astype(np.uint8))
     sections = [
-        _section_as_filmed(shown),
+        _section_as_filmed(lift, shown),
         _section_outcome(lift, shown),
         _section_seeing(lift, overlay, models),
         *_section_models(models),
@@ -100,11 +100,11 @@ def _film(path: Path) -> bytes:
     return path.read_bytes() if path.is_file() and path.stat().st_size <= FILM_MAX else b""
 
 
-def _section_as_filmed(shown: Shown) -> Section:
+def _section_as_filmed(lift: Lift, shown: Shown) -> Section:
     """The card, first of all: whether what follows can be used."""
     from fluidlift.evaluate.as_filmed import HEADER
 
-    card = card_of({"simulation": {"as_filmed": shown.as_filmed}})
+    card = card_of({"simulation": {"as_filmed": shown.as_filmed}, "metrics": {"certainty": certainty(lift)}})
     if isinstance(card, str):
         return Section("As filmed", notes=[f"How near the re-simulation stays to the clip is not known: {card}."])
     said = card.sentence()

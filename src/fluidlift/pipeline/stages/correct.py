@@ -73,4 +73,4 @@ def nothing_found(read: Read, *, work: Work) -> Segmentation:
     confidence = work.scratch.array("confidence", shape, np.float16)
     labels[:], confidence[:] = Label.BACKGROUND, 0.0
     kept = PixelLabels(work.scratch.keep("labels", labels), work.scratch.keep("confidence", confidence))
-    return Segmentation(kept, 0.0, 0.0, 0.0, False)
+    return Segmentation(kept, 0.0, 0.0, 0.0, 0.0, False)

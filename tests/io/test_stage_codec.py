@@ -133,7 +133,7 @@ def flow() -> stages.Flow:
 
 def segmentation() -> stages.Segmentation:
     labels = PixelLabels(RNG.integers(0, 3, (T, H, W), np.uint8), floats(T, H, W, dtype=np.float16))
-    return stages.Segmentation(labels, 0.3, 0.9, 0.5, 0.8, False)
+    return stages.Segmentation(labels, 0.3, 0.9, 0.5, False)
 
 
 def refined() -> stages.Refined:

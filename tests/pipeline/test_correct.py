@@ -27,7 +27,7 @@ def seen(frames=3):
     flow = Flow(PixelFlow(displacement, np.ones((frames - 1, h, w), np.float16)), "dis")
     labels = np.full((frames, h, w), Label.BACKGROUND, np.uint8)
     labels[:, h // 2 :] = Label.FLUID
-    found = Segmentation(PixelLabels(labels, np.full(labels.shape, 0.5, np.float16)), 0.5, 0.5, 1.0, 0.5, False)
+    found = Segmentation(PixelLabels(labels, np.full(labels.shape, 0.5, np.float16)), 0.5, 0.5, 1.0, False)
     return Read(clip, np.arange(frames), frames, 0.0, False), flow, found
 
 

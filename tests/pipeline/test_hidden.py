@@ -56,7 +56,7 @@ def seen(tmp_path_factory) -> Seen:
     flow = PixelFlow(motion, np.where(fluid, 0.7, 0.05).astype(np.float16)[None].repeat(FRAMES - 1, axis=0))
     labels = np.where(fluid, Label.FLUID, Label.BACKGROUND).astype(np.uint8)[None].repeat(FRAMES, axis=0)
     read = Read(clip, np.arange(FRAMES), FRAMES, 0.0, False)
-    found = Segmentation(PixelLabels(labels, np.ones(labels.shape, np.float16)), 0.4, 1.0, 1.0, 1.0, True)
+    found = Segmentation(PixelLabels(labels, np.ones(labels.shape, np.float16)), 0.4, 1.0, 1.0, True)
     shape = replace(JobConfig().shape, kind="fall", fov=50.0, pitch=5.0, size=2.0, cells=40)
     config = taken(GeometrySettings, shape, drawn=None)
     folder = tmp_path_factory.mktemp("fall")

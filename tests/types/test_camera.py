@@ -139,3 +139,33 @@ def test_the_position_is_where_all_rays_start():
     pose = RigidTransform(LOOK.camera_from_world.rotation, np.array([0.3, -0.2, 4.0]))
     camera = PinholeCamera((50.0, 60.0), (10.0, 12.0), (32, 24), pose)
     np.testing.assert_allclose(pose.points(camera.position), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(3,), (0, 3), (7, 3), (4, 5, 3)], ids=str)
+def test_points_of_any_shape_are_projected_as_each_alone(shape):
+    camera = PinholeCamera.looking((0.3, -3.0, 1.2), (0.0, 0.0, 0.0), 50.0, (64, 48))
+    points = np.random.default_rng(0).normal(0.0, 2.0, shape)
+    if points.size > 12:
+        points.reshape(-1, 3)[:3] = [[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [0.0, -9.0, 1.0]]  # the last lies behind
+    with np.errstate(invalid="ignore"):
+        uv, depth = camera.project(points)
+        row, column, same = camera.nearest_pixels(points)
+    assert uv.shape == (*shape[:-1], 2) and depth.shape == row.shape == column.shape == shape[:-1]
+    np.testing.assert_array_equal(same, depth)
+    pose, (fx, fy), (cx, cy) = camera.camera_from_world, camera.focal, camera.center
+    for place in np.ndindex(shape[:-1]):
+        with np.errstate(invalid="ignore"):
+            x, y, z = pose.rotation @ points[place] + pose.translation
+            plain = np.array([fx * x / z + cx, fy * y / z + cy])
+        np.testing.assert_allclose(uv[place], plain, rtol=1e-12)
+        seen = np.nan_to_num(plain, posinf=1e9, neginf=-1e9) if z > 0 else np.zeros(2)
+        assert column[place] == int(np.clip(seen[0], 0, 63)) and row[place] == int(np.clip(seen[1], 0, 47))
+
+
+def test_rays_are_those_of_the_pixels_on_the_cameras_axes():
+    camera = PinholeCamera.looking((0.3, -3.0, 1.2), (0.0, 0.0, 0.0), 50.0, (64, 48))
+    rays = camera.rays(camera.pixel_grid())
+    assert rays.shape == (48, 64, 3) and rays.flags.c_contiguous
+    ahead = rays @ camera.camera_from_world.rotation.T
+    np.testing.assert_allclose(ahead[..., 2], 1.0, rtol=1e-12)
+    np.testing.assert_allclose(ahead[..., 0] * camera.focal[0] + camera.center[0], camera.pixel_grid()[..., 0])

@@ -169,3 +169,18 @@ def test_what_is_no_rotation_is_refused(rotation):
 def test_a_scale_is_positive_and_finite(scale):
     with pytest.raises(ValueError, match="scale"):
         Similarity3(scale)
+
+
+@pytest.mark.parametrize("number", [np.float32, np.float64])
+def test_many_points_and_vectors_are_those_of_the_plain_formula_in_rows(number):
+    rng = np.random.default_rng(0)
+    rotation = matrix_from_quat(rng.normal(size=4))
+    rigid, alike = RigidTransform(rotation, rng.normal(size=3)), Similarity3(1.7, rotation, rng.normal(size=3))
+    x = rng.normal(size=(4, 5, 3)).astype(number)
+    for t, scale in ((rigid, 1.0), (alike, 1.7)):
+        turned = scale * np.einsum("ij,...j->...i", rotation, x.astype(np.float64))
+        np.testing.assert_allclose(t.vectors(x), turned, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(t.points(x), turned + t.translation, rtol=1e-12, atol=1e-12)
+        assert t.points(x).flags.c_contiguous and t.vectors(x).flags.c_contiguous
+        assert t.points(x).dtype == t.vectors(x).dtype == np.float64
+    np.testing.assert_array_equal(rigid.coordinates(x), rigid.points(x).reshape(-1, 3).T)

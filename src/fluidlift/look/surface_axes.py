@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.numerics.short_axis import every
-from fluidlift.types import Gaussians, PinholeCamera, Similarity3
+from fluidlift.types import Gaussians, PinholeCamera, RigidTransform, Similarity3
 
 BESIDE = 0.1
 """of the picture's width and height: how far beside it a map over it goes on"""
@@ -62,7 +62,7 @@ class PictureAxes:
 
     def points(self, world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """World points on the map's axes, m. What is not before the camera goes to the rim of the map."""
-        x, y, z = self.camera.camera_from_world.points(np.asarray(world, np.float64)).T
+        x, y, z = self.camera.camera_from_world.coordinates(world)
         near = np.maximum(z, self._nearest)
         return np.stack([self.distance * x / near, -self.distance * y / near, -z], axis=-1)
 
@@ -75,9 +75,8 @@ class PictureAxes:
 
     def velocities(self, world: Float[np.ndarray, "n 3"], moving: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Velocities (m/s) of world points on the map's axes."""
-        rotation = self.camera.camera_from_world.rotation
-        x, y, z = self.camera.camera_from_world.points(np.asarray(world, np.float64)).T
-        u, v, w = (np.asarray(moving, np.float64) @ rotation.T).T
+        x, y, z = self.camera.camera_from_world.coordinates(world)
+        u, v, w = self.camera.camera_from_world.vectors(moving).T
         near = np.maximum(z, self._nearest)
         return np.stack(
             [self.distance * (u - x / near * w) / near, -self.distance * (v - y / near * w) / near, -w], axis=-1
@@ -94,7 +93,7 @@ class PictureAxes:
         z, w = -points[:, 2], -moving[:, 2]
         u = (moving[:, 0] * z + points[:, 0] * w) / self.distance
         v = -(moving[:, 1] * z + points[:, 1] * w) / self.distance
-        return np.stack([u, v, w], axis=-1) @ self.camera.camera_from_world.rotation
+        return RigidTransform(self.camera.camera_from_world.rotation.T).vectors(np.stack([u, v, w], axis=-1))
 
     def world_splats(self, splats: Gaussians) -> Gaussians:
         """Back to the world; their sizes stay those at the distance D."""

@@ -21,6 +21,7 @@ from fluidlift.look.tracer_spacing import bare_points, not_crowded
 from fluidlift.look.whitewater_splats import kinds_of
 from fluidlift.numerics.nearest import nearest
 from fluidlift.types import Gaussians, sh_from_rgb
+from fluidlift.types.rows import rows
 
 PITCH = 0.25
 """cells between tracers, at the coarsest level"""
@@ -192,29 +193,39 @@ class SurfaceSkin:
         # a place is as far from the camera as the four columns around it, or between them; on a ridge slopes cancel
         # out between two columns, where a slope (blurred over three) is at most a level less than beside it
         least, most = ndimage.minimum_filter(columns, 3) - 1, ndimage.maximum_filter(columns, 3)
-        for level in np.unique(columns[surface.wet]):
+        found = np.unique(columns[surface.wet])
+        self._thin_out(found)
+        for level in found:
             self._fill(surface, int(level), (least <= level) & (level <= most), rng)
+
+    def _thin_out(self, found: Int[np.ndarray, " k"]) -> None:
+        """Tracers of some levels go where they are crowded."""
+        keep = np.ones(len(self), bool)
+        for level in found:
+            own = np.flatnonzero(self.levels == level)
+            if len(own) > 1:
+                spacing = PITCH * self._cell * float(finer(int(level)))
+                keep[own] = not_crowded(rows(self.places, own), self.ids[own], CROWDED * spacing)
+        self._keep(keep)
 
     def _fill(
         self, surface: SurfaceMap, level: int, about: Bool[np.ndarray, "nx ny"], rng: np.random.Generator
     ) -> None:
-        """Tracers of a level go where they are crowded, and come where they are drawn apart.
+        """Tracers of a level come where they are drawn apart.
 
         `about` says in which columns of the map there can be places of that level.
         """
         spacing, own = PITCH * self._cell * float(finer(level)), np.flatnonzero(self.levels == level)
-        if len(own) > 1:
-            keep = np.ones(len(self), bool)
-            keep[own] = not_crowded(self.places[own], self.ids[own], CROWDED * spacing)
-            self._keep(keep)
-            own = np.flatnonzero(self.levels == level)
         low = np.floor(surface.low / spacing)
         count = np.ceil(np.array(surface.wet.shape) * surface.pitch / spacing).astype(int) + 1
         # few are bare: only these are asked where they are
-        bare = bare_points(self.places[own], low, spacing, (int(count[0]), int(count[1])), BARE * spacing)
+        bare = bare_points(rows(self.places, own), low, spacing, (int(count[0]), int(count[1])), BARE * spacing)
+        column = [
+            np.clip(np.floor(((low[a] + np.arange(n) + 0.5) * spacing - surface.low[a]) / surface.pitch), 0, most - 1)
+            for a, (n, most) in enumerate(zip(bare.shape, about.shape, strict=True))
+        ]
+        bare &= about[np.ix_(*(c.astype(int) for c in column))]
         lattice = (low + np.argwhere(bare) + 0.5) * spacing
-        column = np.clip(np.floor((lattice - surface.low) / surface.pitch).astype(int), 0, np.array(about.shape) - 1)
-        lattice = lattice[about[column[:, 0], column[:, 1]]]
         lattice = lattice[surface.presence(lattice) > 0.5]
         lattice = lattice[self._levels(lattice) == level]
         fresh = lattice + rng.uniform(-0.25, 0.25, lattice.shape) * spacing
@@ -228,8 +239,11 @@ class SurfaceSkin:
         return np.zeros(len(places), np.int64) if self._level_at is None else self._level_at(places)
 
     def _keep(self, index: np.ndarray) -> None:
-        self.places, self.ids = self.places[index], self.ids[index]
-        self.levels, self.heights = self.levels[index], self.heights[index]
+        if index.all():
+            return
+        kept = np.flatnonzero(index)
+        self.places, self.ids = rows(self.places, kept), self.ids[kept]
+        self.levels, self.heights = self.levels[kept], self.heights[kept]
 
     def points(self, surface: SurfaceMap) -> Float[np.ndarray, "n 3"]:
         """Where the tracers are, m."""

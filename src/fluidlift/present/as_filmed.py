@@ -115,9 +115,9 @@ def certainty(lift: Lift) -> dict[str, float]:
     """How likely it is that mask, kind and tilt are right, of those that no person gave."""
     from fluidlift.shape.fluid_found import chance_of_mask
 
-    g, found = lift.geometry, {}
-    if not lift.segmentation.user_mask:
-        found["mask"] = chance_of_mask(lift.segmentation.likely_overlap)
+    g, mask, found = lift.geometry, lift.segmentation, {}
+    if not mask.user_mask and mask.likely_overlap is not None:
+        found["mask"] = chance_of_mask(mask.likely_overlap)
     if g.kind_source != "user" and g.kind in g.kind_evidence.scores:
         found["kind"] = g.kind_evidence.scores[g.kind]
     if g.up.error > 0.0:

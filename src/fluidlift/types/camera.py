@@ -52,12 +52,21 @@ class PinholeCamera:
 
     def project(self, points: Float[np.ndarray, "*n 3"]) -> tuple[Float[np.ndarray, "*n 2"], Float[np.ndarray, "*n"]]:
         """Pixel positions (u, v) and camera depth z of world points. Points behind the camera keep z <= 0."""
-        x = self.camera_from_world.points(points)
-        z = x[..., 2]
+        u, v, z = self._seen(points)
+        uv = np.empty((len(z), 2))
+        uv[:, 0], uv[:, 1] = u, v
+        shape = np.shape(points)[:-1]
+        return uv.reshape(*shape, 2), z.reshape(shape)
+
+    def _seen(self, points: Float[np.ndarray, "*n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """u, v and depth z, each [m], of world points."""
+        x, y, z = self.camera_from_world.coordinates(points)
         safe = np.where(np.abs(z) < 1e-9, 1e-9, z)
-        u = self.focal[0] * x[..., 0] / safe + self.center[0]
-        v = self.focal[1] * x[..., 1] / safe + self.center[1]
-        return np.stack([u, v], axis=-1), z
+        for axis, (focal, center) in zip((x, y), zip(self.focal, self.center, strict=True), strict=True):
+            axis *= focal
+            axis /= safe
+            axis += center
+        return x, y, z
 
     def nearest_pixels(self, points: Float[np.ndarray, "*n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Row and column of the pixel of the picture nearest to where each world point appears, and its camera depth.
@@ -65,17 +74,21 @@ class PinholeCamera:
         Points outside the picture get a pixel of its edge; for points behind the camera (depth <= 0) the pixel means
         nothing.
         """
-        uv, z = self.project(points)
-        uv = np.where(z[..., None] > 0, np.nan_to_num(uv, nan=0.0, posinf=1e9, neginf=-1e9), 0.0)
-        col = np.clip(uv[..., 0], 0, self.size[0] - 1).astype(int)
-        row = np.clip(uv[..., 1], 0, self.size[1] - 1).astype(int)
-        return row, col, z
+        u, v, z = self._seen(points)
+        behind, shape, found = ~(z > 0), np.shape(points)[:-1], []
+        for place, size in ((v, self.size[1]), (u, self.size[0])):
+            np.fmax(place, 0.0, out=place)  # what is not a number, too
+            np.fmin(place, size - 1, out=place)
+            place[behind] = 0.0
+            found.append(place.astype(int).reshape(shape))
+        return *found, z.reshape(shape)
 
     def rays(self, uv: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 3"]:
         """World directions with unit camera depth: position + z * ray has camera depth z."""
         x = (uv[..., 0] - self.center[0]) / self.focal[0]
         y = (uv[..., 1] - self.center[1]) / self.focal[1]
-        return np.stack([x, y, np.ones_like(x)], axis=-1) @ self.camera_from_world.rotation
+        ahead = np.stack([x, y, np.ones_like(x)], axis=-1)
+        return RigidTransform(self.camera_from_world.rotation.T).vectors(ahead)
 
     def unproject(
         self, uv: Float[np.ndarray, "*n 2"], depth: Float[np.ndarray, "*n"] | float

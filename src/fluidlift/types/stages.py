@@ -117,11 +117,11 @@ class Segmentation:
     """on what was taken for fluid"""
     flow_trusted: float
     """share of the fluid on which optical flow is trusted"""
-    likely_overlap: float
-    """intersection over union with what is fluid, as the labels' confidence has it, 0 to 1"""
     user_mask: bool
     """whether the user gave it"""
     warnings: tuple[Notice, ...] = ()
+    likely_overlap: float | None = None
+    """intersection over union with what is fluid, as the labels' confidence has it, 0 to 1; None: not known"""
 
 
 @dataclass(frozen=True)

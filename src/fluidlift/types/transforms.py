@@ -47,6 +47,15 @@ def quat_from_matrix(matrices: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray,
     return np.where(q[..., :1] < 0, -q, q)
 
 
+def _turned(rotation: Float[np.ndarray, "3 3"], x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "3 m"]:
+    """Rotated vectors as the columns of a wide matrix.
+
+    As the rows of a tall one the product takes four to ten times as long, and starts threads of BLAS that wait for each
+    other where other threads work beside them (200,000 points 2.3 to 8.6 > 0.6 ms); of mixed types it takes longer yet.
+    """
+    return rotation @ np.asarray(x, np.float64).reshape(-1, 3).T
+
+
 @dataclass(frozen=True)
 class RigidTransform:
     """x_target = rotation @ x_source + translation."""
@@ -70,12 +79,17 @@ class RigidTransform:
 
     def points(self, x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Positions, metres."""
-        # of mixed types a product takes five times as long
-        return np.asarray(x, np.float64) @ self.rotation.T + self.translation
+        return np.ascontiguousarray(self.coordinates(x).T).reshape(np.shape(x))
+
+    def coordinates(self, x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "3 m"]:
+        """Positions, metres: each coordinate of all points in a row."""
+        out = _turned(self.rotation, x)
+        out += self.translation[:, None]
+        return out
 
     def vectors(self, v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Directions and velocities: rotated, not moved."""
-        return v @ self.rotation.T
+        return np.ascontiguousarray(_turned(self.rotation, v).T).reshape(np.shape(v))
 
     def inverse(self) -> RigidTransform:
         """source_from_target."""
@@ -104,11 +118,14 @@ class Similarity3:
 
     def points(self, x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Positions."""
-        return self.scale * (x @ self.rotation.T) + self.translation
+        out = _turned(self.rotation, x)
+        out *= self.scale
+        out += self.translation[:, None]
+        return np.ascontiguousarray(out.T).reshape(np.shape(x))
 
     def vectors(self, v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Displacements and velocities (scaled with the lengths)."""
-        return self.scale * (v @ self.rotation.T)
+        return np.ascontiguousarray((self.scale * _turned(self.rotation, v)).T).reshape(np.shape(v))
 
     def covariances(self, c: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3 3"]:
         """Second moments of positions."""

@@ -56,7 +56,8 @@ def correct(
             "at least one pixel of fluid", "take one of them back, or draw fluid",
         )  # fmt: skip
     kept = PixelLabels(work.scratch.keep("labels", labels), work.scratch.keep("confidence", confidence))
-    return Segmentation(kept, *figures, segmentation.user_mask)
+    *shares, likely = figures
+    return Segmentation(kept, *shares, segmentation.user_mask, likely_overlap=likely)
 
 
 def _frames_of(region: Region, times: np.ndarray) -> np.ndarray:
@@ -73,4 +74,4 @@ def nothing_found(read: Read, *, work: Work) -> Segmentation:
     confidence = work.scratch.array("confidence", shape, np.float16)
     labels[:], confidence[:] = Label.BACKGROUND, 0.0
     kept = PixelLabels(work.scratch.keep("labels", labels), work.scratch.keep("confidence", confidence))
-    return Segmentation(kept, 0.0, 0.0, 0.0, 0.0, False)
+    return Segmentation(kept, 0.0, 0.0, 0.0, False)

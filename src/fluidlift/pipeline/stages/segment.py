@@ -68,7 +68,8 @@ def segment(
             )
         )
     kept = work.scratch.keep("labels", labels.labels), work.scratch.keep("confidence", _halved(work, labels.confidence))
-    return Segmentation(PixelLabels(*kept), *found, mask is not None, tuple(warnings))
+    *shares, likely = found
+    return Segmentation(PixelLabels(*kept), *shares, mask is not None, tuple(warnings), likely)
 
 
 def clues(read: Read, flow: Flow, roi: tuple[int, int, int, int] | None) -> Clues:

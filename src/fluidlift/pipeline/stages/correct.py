@@ -56,8 +56,8 @@ def correct(
             "at least one pixel of fluid", "take one of them back, or draw fluid",
         )  # fmt: skip
     kept = PixelLabels(work.scratch.keep("labels", labels), work.scratch.keep("confidence", confidence))
-    *shares, likely = figures
-    return Segmentation(kept, *shares, segmentation.user_mask, likely_overlap=likely)
+    share, sure, trusted, likely = figures
+    return Segmentation(kept, share, sure, trusted, segmentation.user_mask, likely_overlap=likely)
 
 
 def _frames_of(region: Region, times: np.ndarray) -> np.ndarray:

@@ -68,8 +68,8 @@ def segment(
             )
         )
     kept = work.scratch.keep("labels", labels.labels), work.scratch.keep("confidence", _halved(work, labels.confidence))
-    *shares, likely = found
-    return Segmentation(PixelLabels(*kept), *shares, mask is not None, tuple(warnings), likely)
+    share, sure, trusted, likely = found
+    return Segmentation(PixelLabels(*kept), share, sure, trusted, mask is not None, tuple(warnings), likely)
 
 
 def clues(read: Read, flow: Flow, roi: tuple[int, int, int, int] | None) -> Clues:

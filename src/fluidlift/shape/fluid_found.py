@@ -26,10 +26,10 @@ class FluidFigures(NamedTuple):
     """intersection over union with what is fluid, as the labels' confidence has it"""
 
 
-CHANCE = (9.0, -5.42)
+CHANCE = (9.47, -5.72)
 """log odds per unit of the likely overlap, and at none of it, that a mask overlaps what a person drew by 0.7: logistic
-regression over 34 real clips, of which 24 do (`benchmarks/masks_fit.py`). Each by the others: log loss 0.476, 0.637
-without; of those below a half 2 of 5 are right, to 0.8 7 of 12, above 15 of 17"""
+regression over 34 real clips, of which 24 do (`benchmarks/masks_fit.py`). Each by the others: log loss 0.477, 0.637
+without; of those below a half 3 of 7 are right, to 0.8 5 of 9, above 16 of 18"""
 
 
 def chance_of_mask(likely_overlap: float) -> float:

@@ -8,8 +8,9 @@ import pytest
 from fluidlift.errors import InputRejected
 from fluidlift.messages import code_of
 from fluidlift.pipeline.hints import laid_on, time_laid_on
-from fluidlift.pipeline.stages.correct import correct
+from fluidlift.pipeline.stages.correct import correct, nothing_found
 from fluidlift.pipeline.work import Work
+from fluidlift.shape.fluid_found import likely_overlap
 from fluidlift.types import Label, PixelFlow, PixelLabels, VideoClip
 from fluidlift.types.hints import Click, ClipHints, ClipIdentity, Region
 from fluidlift.types.stages import Flow, Read, Segmentation
@@ -65,6 +66,19 @@ def test_a_region_counts_as_given_in_all_frames(tmp_path):
     assert (found.labels.labels[:, 13, 13] == Label.SOLID).all()
     assert (found.labels.confidence[:, 13, 13] == 1.0).all() and found.labels.confidence[0, 20, 2] == 0.5
     assert found.fluid_share < 0.5
+
+
+def test_what_a_person_drew_raises_how_likely_a_mask_is_right_and_is_all_of_it_where_nothing_was_found(tmp_path):
+    read, flow, found = seen()
+    found = replace(found, likely_overlap=likely_overlap(found.labels.labels, found.labels.confidence))
+    all_of_it = Region("fluid", ((-1.0, 15.0), (60.0, 15.0), (60.0, 60.0), (-1.0, 60.0)))
+    drawn = correct(read, flow, found, (all_of_it,), work=Work.alone(tmp_path))
+    assert drawn.likely_overlap > found.likely_overlap > 0.5
+    (tmp_path / "none").mkdir()
+    nothing = nothing_found(read, work=Work.alone(tmp_path / "none"))
+    (tmp_path / "alone").mkdir()
+    alone = correct(read, flow, nothing, (all_of_it,), work=Work.alone(tmp_path / "alone"))
+    assert nothing.likely_overlap is None and alone.likely_overlap is None  # there is no chance to speak of
 
 
 def test_a_region_is_there_while_it_is_said_to_be(tmp_path):

@@ -47,7 +47,7 @@ def quat_from_matrix(matrices: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray,
     return np.where(q[..., :1] < 0, -q, q)
 
 
-def _turned(rotation: Float[np.ndarray, "3 3"], x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "3 m"]:
+def turned(rotation: Float[np.ndarray, "3 3"], x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "3 m"]:
     """Rotated vectors as the columns of a wide matrix.
 
     As the rows of a tall one the product takes four to ten times as long, and starts threads of BLAS that wait for each
@@ -83,13 +83,13 @@ class RigidTransform:
 
     def coordinates(self, x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "3 m"]:
         """Positions, metres: each coordinate of all points in a row."""
-        out = _turned(self.rotation, x)
+        out = turned(self.rotation, x)
         out += self.translation[:, None]
         return out
 
     def vectors(self, v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Directions and velocities: rotated, not moved."""
-        return np.ascontiguousarray(_turned(self.rotation, v).T).reshape(np.shape(v))
+        return np.ascontiguousarray(turned(self.rotation, v).T).reshape(np.shape(v))
 
     def inverse(self) -> RigidTransform:
         """source_from_target."""
@@ -118,14 +118,14 @@ class Similarity3:
 
     def points(self, x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Positions."""
-        out = _turned(self.rotation, x)
+        out = turned(self.rotation, x)
         out *= self.scale
         out += self.translation[:, None]
         return np.ascontiguousarray(out.T).reshape(np.shape(x))
 
     def vectors(self, v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Displacements and velocities (scaled with the lengths)."""
-        return np.ascontiguousarray((self.scale * _turned(self.rotation, v)).T).reshape(np.shape(v))
+        return np.ascontiguousarray((self.scale * turned(self.rotation, v)).T).reshape(np.shape(v))
 
     def covariances(self, c: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3 3"]:
         """Second moments of positions."""

@@ -57,7 +57,8 @@ def correct(
         )  # fmt: skip
     kept = PixelLabels(work.scratch.keep("labels", labels), work.scratch.keep("confidence", confidence))
     share, sure, trusted, likely = figures
-    return Segmentation(kept, share, sure, trusted, segmentation.user_mask, likely_overlap=likely)
+    asked = None if segmentation.likely_overlap is None else likely  # None: a person drew all of it
+    return Segmentation(kept, share, sure, trusted, segmentation.user_mask, likely_overlap=asked)
 
 
 def _frames_of(region: Region, times: np.ndarray) -> np.ndarray:

@@ -121,8 +121,8 @@ class Segmentation:
     """whether the user gave it"""
     warnings: tuple[Notice, ...] = ()
     likely_overlap: float | None = None
-    """intersection over union with what is fluid, as the labels' confidence has it, 0 to 1; None: not known, or a person
-    drew all of it"""
+    """intersection over union with what is fluid, as the labels' confidence has it, 0 to 1; None: not known, or a
+    person drew all of it"""
 
 
 @dataclass(frozen=True)

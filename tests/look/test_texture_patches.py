@@ -1,5 +1,7 @@
 """The pattern of a surface is carried by the flow, and is not drawn out by it."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -277,6 +279,30 @@ def test_a_surface_seen_in_plan_shows_the_clips_own_picture_whatever_its_level()
         color, there, _ = patches.colors(points)
         assert there.all()
         np.testing.assert_allclose(color, shown_at(FILM, index, 9), atol=1e-4)  # single precision of the projection
+
+
+@pytest.mark.parametrize("seen_in", ["the picture", "plan"])
+def test_pairs_at_home_are_those_that_are_looked_up_like_any_other(seen_in):
+    """A patch a picometre from its own place is asked for its source as one from elsewhere is: the plain way."""
+    if seen_in == "plan":
+        where = surface(uniform(0.5))
+        patches = TexturePatches(SeenTexture(sheet(), CAMERA, where), 0.6, footage=FILM, start=9.0)
+        for k, interval in enumerate([0.0, *[STEP] * 12]):
+            patches.advance(where, interval, np.random.default_rng(k))
+        points = CAMERA.unproject(pixels()[1][:, ::-1] + 0.5, np.full(len(pixels()[1]), 9.4))
+    else:
+        patches, points = played(12, start=9.0), pixels()[0]
+    fast = patches.colors(points)
+    s = patches.state
+    assert len(np.unique(s.instants)) > 3 and (s.sources == s.centers).all()
+    patches.state = replace(s, sources=s.sources + 1e-12)
+    for a, b in zip(fast, patches.colors(points), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-6)  # single precision
+    patches.state = replace(s, sources=s.sources + np.where(np.arange(len(s))[:, None] % 2, 0.3, 0.0))  # some of each
+    mixed, there, _ = patches.colors(points)
+    patches.state = replace(s, sources=patches.state.sources + 1e-12)
+    np.testing.assert_allclose(mixed, patches.colors(points)[0], atol=2e-6)
+    assert there.all() and np.abs(mixed - fast[0]).max() > 0.05
 
 
 def test_a_blend_of_pieces_of_different_instants_is_as_lively_as_each():

@@ -124,7 +124,8 @@ class FluidFootage:
         frame = np.clip(np.rint(instants), 0, len(self) - 1).astype(np.int64)
         out, share = np.zeros((len(index), 3), np.float32), np.zeros(len(index), np.float32)
         _residual(self.frames, self.fluid, self.pure, self.mean, index.astype(np.float64), frame, home, out, share)
-        steady = np.where(home[:, None], sampled(self.mean, index), sampled(self.inner, index))
+        steady, other = sampled(self.mean, index), np.flatnonzero(~home)
+        steady[other] = sampled(self.inner, index[other])
         return steady, out, share
 
     def covers(self, index: Float[np.ndarray, "n 2"], instants: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from jaxtyping import Bool, Float, Num
+from jaxtyping import Bool, Float, Int, Num
 from scipy import ndimage
 
 from fluidlift.errors import require
@@ -329,12 +329,19 @@ class TexturePatches:
         np.maximum.at(heaviest, point, weight)
         counts = weight > 1e-3 * heaviest[point]
         point, patch, weight = point[counts], patch[counts], weight[counts]
-        sources = rows(s.sources, patch) + _turned(rows(places, point) - rows(s.centers, patch), -s.turns[patch])
+        # patches in their own place, as all are where nothing was edited, show each point what is at the point
+        texture, elsewhere = self._texture, (s.turns != 0.0) | (s.sources != s.centers).any(axis=1)
+        sources, away = rows(places, point), np.flatnonzero(elsewhere[patch])
+        trust = texture.trust(places).take(point)
+        if len(away):
+            own = patch[away]
+            sources[away] = rows(s.sources, own) + _turned(rows(sources, away) - rows(s.centers, own), -s.turns[own])
+            trust[away] = texture.trust(rows(sources, away))
         # what was not seen (a rock, a bank) shows only where no other patch is
-        weight = weight * np.clip(2 * self._texture.trust(sources) - 0.8, 1e-4, 1.0)
-        texture = self._texture
+        weight = weight * np.clip(2 * trust - 0.8, 1e-4, 1.0)
         if self._footage is not None or not isinstance(texture, SeenTexture):
-            return self._played(np.asarray(points, np.float64), point, sources, s.instants[patch], weight)
+            pairs = _Pairs(point, away, rows(sources, away), s.instants[patch], weight)
+            return self._played(np.asarray(points, np.float64), pairs)
         color, there = texture.colors(sources)
         # brightness alone: tinted by the water of another place, white foam would turn pink
         bright = texture.shade(points).mean(axis=1)[point] / there.mean(axis=1)
@@ -343,9 +350,7 @@ class TexturePatches:
         mean = _summed(point, weight[:, None] * color, n) / np.maximum(total, 1e-30)[:, None]
         return np.clip(mean, 0.0, 1.0), total > 0, np.ones(n)
 
-    def _played(
-        self, points: np.ndarray, point: np.ndarray, sources: np.ndarray, instants: np.ndarray, weight: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _played(self, points: np.ndarray, pairs: _Pairs) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Colours [n,3], whether there are any [n], and how much of the fluid is [n], from pairs of a point and a place
         of the footage.
 
@@ -356,15 +361,19 @@ class TexturePatches:
         """
         footage, texture = self._footage, self._texture
         assert footage is not None
-        n = len(points)
+        n, point, away, instants, weight = len(points), pairs.point, pairs.away, pairs.instants, pairs.weight
         # at home, a point is looked up where it is seen now, also where the level has changed
-        seen, rest = texture.seen_at(points), texture.index_of(points[:, :2])
-        index = texture.index_of(sources) + rows(seen - rest, point)
-        home = most(np.abs(index - rows(seen, point))) < SAME
-        index, seen = footage.within(index), footage.within(seen)
-        mean, residual, wet = footage.looked_up(index, instants, home)
+        straight = texture.seen_at(points)
+        seen = footage.within(straight)
         shade = sampled(footage.shade, seen)
-        there = sampled(footage.shade, index)
+        index, home, there = rows(seen, point), np.ones(len(point), bool), rows(shade, point)
+        if len(away):
+            of = point[away]
+            now, rest = rows(straight, of), texture.index_of(rows(points, of)[:, :2])
+            moved = texture.index_of(pairs.sources) + (now - rest)
+            home[away], index[away] = most(np.abs(moved - now)) < SAME, footage.within(moved)
+            there[away] = sampled(footage.shade, rows(index, away))
+        mean, residual, wet = footage.looked_up(index, instants, home)
         brighter = mean_of(shade).take(point) / np.maximum(mean_of(there), 1e-3)
         gain = np.clip(brighter, 1 / LARGEST_RATIO, LARGEST_RATIO)
         fine = mean - there
@@ -376,6 +385,20 @@ class TexturePatches:
         still = _summed(point, (weight * gain)[:, None] * fine, n) / np.maximum(total, 1e-30)[:, None]
         lively = _summed(point, (weight * gain)[:, None] * residual, n) / np.maximum(spread, 1e-30)[:, None]
         return np.clip(shade + still + lively, 0.0, 1.0), total > 0, covers
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """A point and a patch that is there."""
+
+    point: Int[np.ndarray, " m"]
+    away: Int[np.ndarray, " k"]
+    """pairs whose patch shows another place than its own"""
+    sources: Float[np.ndarray, "k 2"]
+    """x, y (m) of what these show"""
+    instants: Float[np.ndarray, " m"]
+    """frames of the footage"""
+    weight: Float[np.ndarray, " m"]
 
 
 def _summed(point: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:

@@ -26,7 +26,8 @@ BEYOND = 3
 
 
 WORST_TILT = 8.0
-"""degrees that a tilt that is right is off at most: lengths along the view come out wrong by a third"""
+"""degrees that a tilt that is right is off at most: from 25 degrees down, lengths along the view come
+out wrong by a third"""
 
 
 class Reel:

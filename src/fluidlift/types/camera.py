@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import InputRejected, require
-from fluidlift.types.transforms import RigidTransform, turned
+from fluidlift.types.transforms import RigidTransform, in_rows, turned
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class PinholeCamera:
         x = (uv[..., 0] - self.center[0]) / self.focal[0]
         y = (uv[..., 1] - self.center[1]) / self.focal[1]
         ahead = np.stack([x, y, np.ones_like(x)], axis=-1)
-        return np.ascontiguousarray(turned(self.camera_from_world.rotation.T, ahead).T).reshape(ahead.shape)
+        return in_rows(turned(self.camera_from_world.rotation.T, ahead), ahead.shape)
 
     def unproject(
         self, uv: Float[np.ndarray, "*n 2"], depth: Float[np.ndarray, "*n"] | float

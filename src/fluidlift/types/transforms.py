@@ -56,6 +56,11 @@ def turned(rotation: Float[np.ndarray, "3 3"], x: Float[np.ndarray, "*n 3"]) -> 
     return rotation @ np.asarray(x, np.float64).reshape(-1, 3).T
 
 
+def in_rows(wide: Float[np.ndarray, "3 m"], shape: tuple[int, ...]) -> Float[np.ndarray, "*n 3"]:
+    """The columns of a wide matrix as the rows of an array of a shape."""
+    return np.ascontiguousarray(wide.T).reshape(shape)
+
+
 @dataclass(frozen=True)
 class RigidTransform:
     """x_target = rotation @ x_source + translation."""
@@ -79,7 +84,7 @@ class RigidTransform:
 
     def points(self, x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Positions, metres."""
-        return np.ascontiguousarray(self.coordinates(x).T).reshape(np.shape(x))
+        return in_rows(self.coordinates(x), np.shape(x))
 
     def coordinates(self, x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "3 m"]:
         """Positions, metres: each coordinate of all points in a row."""
@@ -89,7 +94,7 @@ class RigidTransform:
 
     def vectors(self, v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Directions and velocities: rotated, not moved."""
-        return np.ascontiguousarray(turned(self.rotation, v).T).reshape(np.shape(v))
+        return in_rows(turned(self.rotation, v), np.shape(v))
 
     def inverse(self) -> RigidTransform:
         """source_from_target."""
@@ -121,11 +126,11 @@ class Similarity3:
         out = turned(self.rotation, x)
         out *= self.scale
         out += self.translation[:, None]
-        return np.ascontiguousarray(out.T).reshape(np.shape(x))
+        return in_rows(out, np.shape(x))
 
     def vectors(self, v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Displacements and velocities (scaled with the lengths)."""
-        return np.ascontiguousarray((self.scale * turned(self.rotation, v)).T).reshape(np.shape(v))
+        return in_rows(self.scale * turned(self.rotation, v), np.shape(v))
 
     def covariances(self, c: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3 3"]:
         """Second moments of positions."""

@@ -35,6 +35,13 @@ def smoke(channel, **more):
     return channel(FRAMES, kind="plume", **{"cell_types": closed} | more)
 
 
+def flowed_in(scene):
+    """The body's particles as if they had come through the inlet: each as heavy as eight to a cell are."""
+    each = scene.parameters.density * (0.5 * scene.terrain.grid.spacing) ** 3
+    body = scene.body
+    return replace(body, ids=body.ids + len(body), masses=np.full(len(body), each, np.float32))
+
+
 def shown(scene, film, number=0, particles=None):
     particles = scene.body if particles is None else particles
     bare = replace(scene.rest.select(particles.source), means=particles.positions)
@@ -119,7 +126,7 @@ def test_what_flows_in_has_as_much_smoke_as_the_film_shows_about_the_inlet_in_th
     near = beside_inlet(scene.rest.means, scene.cell_types, scene.terrain.grid, SOURCE)
     columns = np.unique(np.floor(scene.camera.project(scene.rest.means[near])[0][:, 0]).astype(int))
     shares = [film.layer(t)[1][:, columns.min() : columns.max() + 1].sum() for t in range(FRAMES)]
-    came = replace(scene.body, ids=scene.body.ids + len(scene.body))
+    came = flowed_in(scene)
     depths = [-np.log1p(-alpha(shown(scene, film, 5, body)[0], scene)).sum() for body in (scene.body, came)]
     assert 1.5 < np.mean(shares) / shares[0] == pytest.approx(depths[1] / depths[0], rel=0.1)
 
@@ -202,3 +209,15 @@ def test_it_is_round_however_far_its_particles_are_drawn_out(channel, tmp_path):
     for name in ("means", "quats", "scales", "opacities", "sh"):
         np.testing.assert_array_equal(getattr(rest, name), getattr(stretched, name))
     assert np.ptp(stretched.scales, axis=1).max() == 0.0
+
+
+def test_a_particle_that_came_in_for_others_as_well_is_as_much_smoke_as_they_are(channel):
+    scene, film = smoke(channel, changes=("gravity",)), puff(0.4)
+    came = flowed_in(scene)
+    few = came.select(slice(0, None, 2))
+    depths = []
+    for particles in (came, few, replace(few, masses=2.0 * few.masses)):
+        there = alpha(shown(scene, film, 5, particles)[0], scene)
+        depths.append(-np.log1p(-np.minimum(there, 0.99)).sum())
+    assert depths[1] < 0.6 * depths[0]
+    assert depths[2] == pytest.approx(depths[0], rel=0.1)

@@ -102,6 +102,27 @@ def test_smoke_leaves_through_the_top_and_is_removed(scene):
     assert removed > 500 and simulator.grid.contains(simulator.particles.positions).all()
 
 
+def test_a_wide_source_is_thinned_out_and_brings_as_much_smoke_as_without(scene):
+    grid = Grid((10, 10, 16), H)
+    types = scene.cells(grid)
+    types[1:-1, 1:-1, :2] = CellType.INFLOW
+    parameters = FluidParameters(density=1.2, inflow_velocity=(0, 0, 1.0), time_step=0.04)
+    whole, thinned = (
+        GasSimulator(grid, scene.terrain(grid), parameters, nobody(), cell_types=types, buoyancy=1.0) for _ in range(2)
+    )
+    thinned.most = 2000
+    for _ in range(10):
+        counts = [s.advance(0.2).n_particles for s in (whole, thinned)]
+        assert counts[1] <= 2 * 2000
+    assert counts[0] > 5000
+    mass = [s.particles.masses.sum() for s in (whole, thinned)]
+    assert mass[1] == pytest.approx(mass[0], rel=0.05)  # some 2000 of them, a share of which is kept: 3 % is their noise
+    rises = [s.velocity.w[2:-2, 2:-2, 4:].mean() for s in (whole, thinned)]
+    assert rises[1] == pytest.approx(rises[0], rel=0.02)
+    inside = thinned._inlet.beside(thinned.particles.positions)
+    assert (thinned.particles.masses[~inside] > 1.5 * whole.particles.masses[0]).mean() > 0.5
+
+
 def test_an_initial_velocity_that_is_not_finite_is_refused(scene):
     grid = Grid((4, 4, 4), H)
     wind = FaceVelocity.zeros(grid)

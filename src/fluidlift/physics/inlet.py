@@ -369,6 +369,10 @@ class Inlet:
         """Particles in INFLOW cells."""
         return self._within(positions, self._cells, 0)
 
+    def beside(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Particles in INFLOW cells and in those next to them: the ones that say whether a place lacks a particle."""
+        return self._within(positions, self._beside, 1)
+
     def _within(self, positions: np.ndarray, cells: Bool[np.ndarray, "nx ny nz"], margin: int) -> np.ndarray:
         """Which positions lie in some of the cells, all of which are at most a margin (cells) beside the INFLOW cells.
 
@@ -444,8 +448,7 @@ class Inlet:
         candidates = candidates[self.inside(candidates)]
         clear = own.clear
         candidates = candidates[sample_nodes(self._walls.signed_distance, grid, candidates) > clear]
-        # what is as near as that to a place lies in its own cell or in one beside it
-        near = positions[self._within(positions, self._beside, 1)]
+        near = positions[self.beside(positions)]  # what is as near as that to a place
         if len(near) and len(candidates):
             distance, _ = cKDTree(near).query(candidates, distance_upper_bound=own.reach)
             candidates = candidates[~np.isfinite(distance)]

@@ -110,8 +110,11 @@ def advance(
         InputRejected: the disk is full.
     """
     from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
+    from fluidlift.physics.gas import GasSimulator
 
     most = max(max_particles, len(scene.rest) if kind_of(scene.kind).is_gas else 0)  # smoke spreads, a liquid does not
+    if isinstance(simulator, GasSimulator):
+        simulator.most = most
     with ThreadPoolExecutor(1, "simulation") as beside, Written() as written:
         coming: Future[StepReport] | None = None
         for k in range(len(history), scene.simulated):

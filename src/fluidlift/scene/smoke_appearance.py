@@ -120,6 +120,7 @@ class SmokeAppearance:
         wide = self._widest(pixel)
         self._amounts = shared_depth(uv, CARRIED * wide, depth, np.zeros(len(uv))) * _area(CARRIED * wide, pixel)
         self._colors = sampled(color, uv[:, ::-1] - 0.5)
+        self._mass = scene.parameters.density * (CARRIED * scene.terrain.grid.spacing) ** 3
         self._first = int(scene.body.ids.max()) + 1 if len(scene.body.ids) else 0
         self._inflow = self._inflow_over_first(uv, depth)
         leaves = scene.cell_types == CellType.OUTFLOW
@@ -153,7 +154,9 @@ class SmokeAppearance:
         grid = self._scene.terrain.grid
         cells = np.clip(grid.cell_of(particles.positions), 0, np.asarray(grid.shape) - 1)
         amounts = self._amounts[particles.source] / _area(about, pixel)
-        came_in = np.where(particles.ids >= self._first, self._inflow, 1.0)
+        # where a particle stands for others as well (`GasSimulator.most`), for as much smoke as its mass says
+        stands_for = np.maximum(particles.masses / self._mass, 1.0)
+        came_in = np.where(particles.ids >= self._first, self._inflow * stands_for, 1.0)
         return amounts * came_in * smoothstep(self._away[tuple(cells.T)], 0.0, LEAVING)
 
     def _seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

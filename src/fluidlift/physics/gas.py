@@ -35,8 +35,8 @@ SLOWER = 99.9
 """per cent of the smoke by which substeps are chosen: particles that slip through a slit beside a wall are some in ten
 thousand, several times as fast as all others (6.1 m/s, where 99.9 % have 3.1, over a grill), and passive"""
 THINNED = (1.5, 2.0)
-"""of `GasSimulator.most`: from where on what leaves the inlet is thinned out, and up to where to `FEWEST` of it. At twice
-as many a simulation ends (`simulate.max_particles`)"""
+"""of `GasSimulator.most`: from where on what leaves the inlet is thinned out, and up to where to `FEWEST` of it. At
+twice as many a simulation ends (`simulate.max_particles`)"""
 FEWEST = 0.1
 """share of what leaves the inlet that is kept at least: with less a cell holds no particle most of the time"""
 

@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import cv2
@@ -280,6 +281,16 @@ def write_pixels(path: Path, pixels: dict[str, dict[str, np.ndarray]]) -> None:
     np.savez_compressed(path, names=np.array(names), clip=clip, **joined)
 
 
+def over_real_clips(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Median, mean and least overlap of the real clips."""
+    real = [r["value"] for r in records if r["figure"] == "IoU" and r["subject"].startswith("clip ")]
+    found = {"median": np.median(real), "mean": np.mean(real), "least": np.min(real)}
+    return [
+        {"subject": f"{len(real)} clips, {name}", "figure": "IoU", "value": round(float(value), 3)}
+        for name, value in found.items()
+    ]
+
+
 def main() -> None:
     """Measure what was asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -309,10 +320,12 @@ def main() -> None:
         sure.append(calibration(found, ready.truth))
         ious.append(iou)
         print(f"{subject.name:28} {iou:.3f} {seconds:5.1f} s", flush=True)
-        records.append({"subject": subject.name, "figure": "IoU", "value": round(iou, 3)})
         likely = likely_overlap(found.labels, found.confidence)
-        records.append({"subject": subject.name, "figure": "likely IoU", "value": round(likely, 3)})
-        records.append({"subject": subject.name, "figure": "time", "value": round(seconds, 1)})
+        records += [
+            {"subject": subject.name, "figure": "IoU", "value": round(iou, 3)},
+            {"subject": subject.name, "figure": "likely IoU", "value": round(likely, 3)},
+            {"subject": subject.name, "figure": "time", "value": round(seconds, 1)},
+        ]
         if args.pixels is not None:
             pixels[subject.name] = sampled_pixels(ready, found)
         if args.water is not None and (some := water_pixels(ready, found)) is not None:
@@ -333,8 +346,14 @@ def main() -> None:
     if args.water is not None:
         write_pixels(args.water, water)
     if not args.dry:
-        records.append({"subject": "all", "figure": "calibration error", "value": round(off, 3)})
-        put("masks", records, date=time.strftime("%Y-%m-%d"), machine=f"{platform.machine()}, {platform.system()}")
+        summary = [{"subject": "all", "figure": "calibration error", "value": round(off, 3)}]
+        summary += over_real_clips(records) if args.only is None else []
+        put(
+            "masks",
+            records + summary,
+            date=time.strftime("%Y-%m-%d"),
+            machine=f"{platform.machine()}, {platform.system()}",
+        )
 
 
 if __name__ == "__main__":

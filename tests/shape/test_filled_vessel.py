@@ -13,6 +13,7 @@ from fluidlift.shape.filled_vessel import (
     find_vessel,
     pool_depths,
     seen_higher,
+    vessel_of,
 )
 from fluidlift.shape.kind import level_camera
 from fluidlift.types import PinholeCamera, Similarity3, UpEvidence
@@ -220,3 +221,35 @@ def _disc(camera: PinholeCamera, vessel: FilledVessel, z: float) -> np.ndarray:
     ring = [vessel.axis[0] + 0.25 * np.cos(turns), vessel.axis[1] + 0.25 * np.sin(turns), np.full(200, z)]
     corners = np.round(camera.project(np.stack(ring, axis=1))[0] - 0.5).astype(np.int32)
     return cv2.fillPoly(np.zeros(camera.size[::-1], np.uint8), [corners], 1) > 0
+
+
+@pytest.mark.parametrize(("pitch", "level"), [(0.0, 0.03), (-8.0, 0.03), (12.0, 0.03), (12.0, 0.0), (25.0, 0.0)])
+def test_a_glass_that_is_nearly_empty_is_told_by_what_it_holds_later(pitch, level):
+    camera, full = camera_at(pitch), made(pitch, level=0.3)
+    now = FilledVessel(full.axis, full.heights, full.radii, full.floor + level)
+    mask, ever = silhouette(camera, now), silhouette(camera, now) | silhouette(camera, full)
+    found = vessel_of(camera, mask, ever, AWAY)
+    assert found is not None
+    assert found.nearly_empty is (find_vessel(camera, mask, AWAY) is None)  # of some its own silhouette tells
+    pixel = AWAY / camera.focal[0] / np.cos(np.radians(pitch))
+    assert found.floor == pytest.approx(full.floor, abs=3.0 * pixel)
+    assert found.level - found.floor == pytest.approx(level, abs=4.0 * pixel)  # two ends, as above
+    assert found.heights[0] == found.floor and found.heights[-1] == pytest.approx(found.level)
+    higher = seen_higher(found, camera, ever)
+    assert (np.abs(higher.radius_at(np.linspace(full.floor + 0.05, full.level - 0.05, 9)) - 0.25) < 3.0 * pixel).all()
+    assert higher.heights[-1] == pytest.approx(full.level, abs=3.0 * pixel) and higher.level == found.level
+    assert (np.diff(higher.heights) > 0).all()
+    volume = filled_volume(higher, camera, ever)
+    assert volume == pytest.approx(full.volume, rel=0.1)
+    nearly = filled_volume(higher, camera, mask)
+    assert nearly is not None and nearly == pytest.approx(now.volume, abs=4.0 * pixel * np.pi * 0.25**2)
+
+
+def test_a_heap_that_does_not_become_more_is_in_no_vessel():
+    camera, truth = camera_at(12.0), made(12.0)
+    heap = silhouette(camera, truth)
+    sways = heap | np.roll(heap, 3, axis=1)
+    low = heap.copy()
+    low[: np.argmax(heap.sum(axis=1) > 60) + 12, :] = False  # its top is hidden now, and the jet with it
+    assert find_vessel(camera, low, AWAY) is None and find_vessel(camera, sways, AWAY) is not None
+    assert vessel_of(camera, low, sways, AWAY) is None

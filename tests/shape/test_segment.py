@@ -472,7 +472,7 @@ def test_water_that_moves_too_little_to_tell_joins_by_its_colour_and_the_banks_d
     lively = np.zeros((HEIGHT, WIDTH), bool)
     lively[42:88] = True
     score = fluid_score(evidence)
-    found = with_quiet_water(evidence, score, lively)
+    found = with_quiet_water(evidence.typical, score, lively)
     assert float(np.median(score[92:103])) < 0.0, "else motion alone would tell"
     assert found[92:103].mean() > 0.85
     assert found[:35].mean() < 0.05 and found[110:].mean() < 0.05

@@ -308,7 +308,7 @@ def _surface(seen: Sight, pictures: DepthPictures | None, fluid: FluidMasks, giv
     """Up, the level camera, the surface of what lies, metres per unit where they are known, and the depth behind it."""
     lying, up = seen.parts.lying, seen.up
     canonical = kinds.level_camera(seen.known, up)
-    observed = _observation(seen, canonical, interval)
+    observed = _observation(seen, canonical, interval, fluid)
     front, known_scale = _front(seen, given.bodies, observed)
     if seen.parts.puddle:
         front = surface.level_surface(canonical, lying)
@@ -494,14 +494,14 @@ def _learned_tilt(
     return found.tilt(camera), camera
 
 
-def _observation(seen: Sight, canonical: PinholeCamera, interval: float) -> Observation:
+def _observation(seen: Sight, canonical: PinholeCamera, interval: float, fluid: FluidMasks) -> Observation:
     """What lies, as the builder of its kind wants it."""
     trust = composite.trust_beside_jets(seen.parts, canonical, seen.motion, seen.lying_trust)
     slopes = SlopePrior(composite.level_prior(seen.parts, seen.motion, seen.trust), seen.steep)
     return Observation(
         canonical, seen.parts.lying, seen.motion, trust, interval, camera_height=seen.height,
         tilt_known=seen.tilt_known, slopes=slopes, roll=seen.up.roll, standing=seen.stood, ledges=seen.parts.ledges,
-        rims=seen.heeded_rims,
+        rims=seen.heeded_rims, ever=fluid.any_frame(),
     )  # fmt: skip
 
 

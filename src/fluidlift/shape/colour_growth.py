@@ -53,18 +53,17 @@ def colour_odds(picture: np.ndarray, fluid: np.ndarray, other: np.ndarray) -> np
     return np.clip(np.log(shares[0] / shares[1]), -DECISIVE, DECISIVE).astype(np.float32)
 
 
-def with_quiet_water(evidence: Evidence, score: np.ndarray, region: np.ndarray, *, rounds: int = 3) -> np.ndarray:
+def with_quiet_water(picture: np.ndarray, score: np.ndarray, region: np.ndarray, *, rounds: int = 3) -> np.ndarray:
     """The region, bool [h,w], and what is quiet beside it and has its colours.
 
     Nothing is taken away, and nothing that moves is added: motion has decided there.
 
     Args:
-        evidence: of the clip.
+        picture: float32 [h,w,3], opponent colours: how places look where they are fluid.
         score: float32 [h,w], log odds of fluid.
         region: bool [h,w], what motion and edges gave.
         rounds: in which the colours are read anew from the larger region.
     """
-    picture = evidence.typical
     across, down = edge_weights(picture, STIFFNESS)
     chance = 1.0 / (1.0 + np.exp(-score))
     found = region

@@ -64,6 +64,9 @@ pool's own"""
 FAR_WALL = 0.15
 """of the far half of a rim's disc, from which what a pool leaves free there and not on the near side is wall above it:
 outlines of pools err by a few hundredths, on all sides (a choice)"""
+FILLED = 0.5
+"""of how high a vessel is ever seen filled, to which it is at first at most where only that tells it: what does not
+become more is a heap (a choice)"""
 FILLS = 0.1
 """of what is seen of a liquid in a vessel on average, by which it is more in the last third of a clip than in the first
 where the vessel fills (a choice: outlines err by a few hundredths)"""
@@ -89,6 +92,8 @@ class FilledVessel:
     """z of its upper edge where that is seen, by what it hides"""
     mouth: VesselRim | None = None
     """its rim where that is seen: the radii are known up to it"""
+    nearly_empty: bool = False
+    """what it holds at the first instant is too little to tell it: what it holds later does"""
 
     @property
     def floor(self) -> float:
@@ -144,7 +149,7 @@ class FilledVessel:
         return FilledVessel(
             (float(low[0]), float(low[1])), low[2] + t.scale * self.heights, t.scale * self.radii,
             float(low[2] + t.scale * self.level), triple(t.rotation @ self.inflow), self.looked_into,
-            None if self.edge is None else float(low[2] + t.scale * self.edge), mouth,
+            None if self.edge is None else float(low[2] + t.scale * self.edge), mouth, self.nearly_empty,
         )  # fmt: skip
 
 
@@ -217,6 +222,62 @@ def find_vessel(
         (float(axis[0]), float(axis[1])), heights + eye[2], np.interp(heights, z, radius), level + float(eye[2]),
         triple(way / np.linalg.norm(way)), looked_into, edge,
     )  # fmt: skip
+
+
+def vessel_of(
+    camera: PinholeCamera,
+    mask: Bool[np.ndarray, "h w"],
+    ever: Bool[np.ndarray, "h w"],
+    distance: float,
+    rims: Sequence[Ellipse] = (),
+    mouth: VesselRim | None = None,
+) -> FilledVessel | None:
+    """The vessel as it is filled in one picture: by what it holds there, or, where that is little yet, by what it holds
+    later. None where neither tells one.
+
+    Args:
+        ever: pixels that are fluid in at least one frame.
+        camera, mask, distance, rims, mouth: as of `find_vessel`.
+    """
+    found = find_vessel(camera, mask, distance, rims, mouth)
+    if found is not None and (found.mouth is not None or not found.looked_into):
+        return found  # a little at the bottom of a glass has the silhouette of a surface alone
+    later = find_vessel(camera, ever, distance, rims, mouth)
+    if later is None or later.looked_into:
+        return found
+    level = level_in(later, camera, mask)
+    share = (level - later.floor) / (later.level - later.floor)
+    if share > FILLED:
+        return found
+    heights = np.linspace(later.floor, level, max(int(share * len(later.heights)), 2))
+    return replace(later, heights=heights, radii=later.radius_at(heights), level=level, nearly_empty=True)
+
+
+def level_in(vessel: FilledVessel, camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]) -> float:
+    """z of the surface of what a vessel holds in a picture, by the rows over its floor that are as wide as its inside;
+    a row's height over its floor where there is none, or the picture shows too little of the fluid to tell.
+
+    Args:
+        vessel: in the camera's world, its radii known as high as it is ever filled.
+        camera: that sees it.
+        mask: fluid pixels.
+    """
+    eye, (right, forward), distance = camera.position, _level_axes(camera), _ahead(vessel, camera)
+    least = vessel.floor + distance / max(camera.focal)
+    plane = _Rectified.of(camera, mask, eye, right, forward, distance)
+    if plane is None:
+        return least
+    wide = plane.width > 2.0 * NARROW * vessel.radius_at(plane.z + eye[2])
+    first = int(np.argmax(wide))
+    top = float(vessel.heights[-1])
+    if not wide.any() or plane.z[first] + eye[2] > 0.5 * (vessel.floor + top):  # a puddle in mid-air
+        return least
+    above = np.flatnonzero(~wide[first:])
+    last = first + int(above[0]) if len(above) else len(wide)
+    row = float(plane.z[last - 1]) + 0.5 * float(plane.z[1] - plane.z[0])
+    profile = vessel.heights - eye[2], vessel.radii
+    level = _circle_at(row, 0.5 * float(plane.width[last - 1]), profile, distance, near=row > 0.0)
+    return float(np.clip(level + eye[2], least, top))
 
 
 def _below_rim(mouth: VesselRim, level: Level, lean: np.ndarray) -> FilledVessel:
@@ -322,6 +383,8 @@ def filled_volume(vessel: FilledVessel, camera: PinholeCamera, mask: Bool[np.nda
     if vessel.mouth is not None:
         found = level_below(vessel.mouth, camera, mask, vessel.radius_at)
         return None if found is None else replace(vessel, level=max(found.z, vessel.floor)).volume
+    if vessel.nearly_empty:
+        return replace(vessel, level=level_in(vessel, camera, mask)).volume
     found = find_vessel(camera, mask, _ahead(vessel, camera))
     return None if found is None else replace(vessel, level=max(found.level, vessel.floor)).volume
 

@@ -64,10 +64,12 @@ def grows(presence: Presence, where: np.ndarray) -> bool:
     return False
 
 
-def always(presence: Presence) -> Presence:
-    """The same clip with everything there from its first to its last frame."""
-    first = np.zeros_like(presence.first)
-    return replace(presence, first=first, last=np.full_like(first, presence.frames - 1))
+def always(presence: Presence, where: np.ndarray | None = None) -> Presence:
+    """The same clip with everything (of `where`, bool [h,w]; None: all) there from its first to its last frame."""
+    there = np.ones(presence.first.shape, bool) if where is None else where
+    return replace(
+        presence, first=np.where(there, 0, presence.first), last=np.where(there, presence.frames - 1, presence.last)
+    )
 
 
 def remaining(presence: Presence) -> Presence:

@@ -23,6 +23,7 @@ from fluidlift.errors import InputRejected, require
 from fluidlift.messages import Notice
 from fluidlift.shape.background import in_own_colours
 from fluidlift.shape.carried_layers import by_either, carried_layers
+from fluidlift.shape.change_points import Arrivals, arrivals, bare_before
 from fluidlift.shape.colour_growth import grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence, pair_reader, solids_by_flow
 from fluidlift.shape.frame_pictures import working_size
@@ -59,6 +60,9 @@ per unit of the score, and the score beyond which it says no more: logistic regr
 (`benchmarks/masks_fit.py` gives 1.87 and 0.30; 1.7 to 2.0 for an outline with each clip left out; held lower, so that
 nothing is sure where the loudest score speaks against it). Of those pixels
 with a chance of 0.8 by it, 8 in 10 are right"""
+FALLING, EARLY = 0.02, 0.2
+"""part of the area that fills, which is seen of the jet above it at least: a jet of a tenth of a glass's width, as long
+as a fifth of that is filled; part of the clip in which it is there from the first frame on for most of it"""
 
 
 class LabelWriter:
@@ -154,11 +158,12 @@ class Clues:
     def advances(self) -> bool:
         """Whether it comes into the picture, or leaves it, instead of staying in its bed.
 
-        What a jet sways over is seen active in the course of the clip, too, and is there from first to last.
+        What a jet sways over is seen active in the course of the clip, too, and is there from first to last; so is the
+        jet that fills a glass.
         """
         if self.grown is not None or self.horizon is not None:
             return False
-        return grows(self.presence, self.score > 2.0) and self.jets is None
+        return grows(self.presence, self.score > 2.0) and self.jets is None and self.arrivals is None
 
     @cached_property
     def _first(self) -> np.ndarray:
@@ -176,6 +181,20 @@ class Clues:
         if self.grown is not None or self.horizon is not None:
             return None
         return swaying_jets(self.evidence, self._without_plants)
+
+    @cached_property
+    def arrivals(self) -> Arrivals | None:
+        """Where it comes for good below a jet; None where it does nowhere, and where change or a horizon tells
+        otherwise. What rises by itself, as smoke does, has nothing above it but air."""
+        if self.grown is not None or self.horizon is not None:
+            return None
+        found = arrivals(self.evidence, self.bed.region, self.inside)
+        if found is None or self.jets is not None:
+            return found
+        top = int(np.argmax(found.where.any(axis=1)))
+        above = self.presence.first[:top][self.bed.region[:top]]
+        early = len(above) > FALLING * found.where.sum() and np.median(above) < EARLY * self.presence.frames
+        return found if early else None
 
     @cached_property
     def vessels(self) -> tuple[Vessel, ...]:
@@ -327,6 +346,10 @@ def staying_labels(known: Clues, clicks: Clicks) -> Iterator[tuple[np.ndarray, n
         presence, still = always(presence), np.zeros_like(still)
     elif known.jets is not None:  # a heap lies still where it has been poured: it neither leaves nor is a rock
         presence, still = remaining(presence), np.zeros_like(still)
+    arriving = known.arrivals
+    if arriving is not None:  # the change tells when, and activity near it does not; what is as still is no rock
+        region = arriving.with_what_was_there(evidence, score, region, known.inside & ~known.solids) & ~asked & ~rocks
+        presence, still = always(presence, arriving.and_below), np.zeros_like(still)
     still = still | asked | rocks
     found = lasting_labels(known.told, region, still, presence)
     if grown is None:
@@ -336,6 +359,8 @@ def staying_labels(known: Clues, clicks: Clicks) -> Iterator[tuple[np.ndarray, n
             dry = (ashore | bare for ashore, bare in zip(dry, bare_over_time(evidence, washed), strict=True))
         if known.jets is not None:
             dry = (bare | free for bare, free in zip(dry, uncovered_over_time(evidence, known.jets), strict=True))
+        if arriving is not None:
+            dry = (bare | free for bare, free in zip(dry, bare_before(evidence, arriving), strict=True))
         found = given_back(found, (bare & ~held for bare in dry))
     return found
 
@@ -417,7 +442,7 @@ def lasting_region(evidence: Evidence, score: np.ndarray, inside: np.ndarray) ->
         return np.zeros(score.shape, bool)
     region = cut_along_edges(evidence.typical, evidence.fine_activity, evidence.level, score)
     region = clean_region(region)
-    return clean_region(with_quiet_water(evidence, score, region) & inside) if region.any() else region
+    return clean_region(with_quiet_water(evidence.typical, score, region) & inside) if region.any() else region
 
 
 def lasting_labels(

@@ -231,13 +231,13 @@ def filling_rate(read: Read, masks: FluidMasks, geometry: Geometry) -> float | N
     level that is not seen to rise may still do so by a row of the picture while the clip lasts; by more it does not,
     however fast the jet falls: the vessel would run over.
     """
-    from fluidlift.shape.filled_vessel import distance_ahead, filled_volume, find_vessel, seen_higher
+    from fluidlift.shape.filled_vessel import distance_ahead, filled_volume, seen_higher, vessel_of
 
     if not kind_of(geometry.kind).fills_vessel or geometry.setting.pool_level is None:
         return None
     clip, camera, mask = read.clip, geometry.camera, geometry.mask
     ahead = distance_ahead(camera, mask, geometry.depth + geometry.half_thickness)
-    vessel = find_vessel(camera, mask, ahead, mouth=geometry.setting.rim)
+    vessel = vessel_of(camera, mask, masks.any_frame(), ahead, mouth=geometry.setting.rim)
     if vessel is None:
         return None
     vessel = seen_higher(vessel, camera, masks.any_frame())

@@ -47,6 +47,8 @@ class Observation:
     """pixels of what comes down steeply onto the rest, as a person marked them"""
     rims: tuple[Ellipse, ...] = ()
     """of vessels, px"""
+    ever: Bool[np.ndarray, "h w"] | None = None
+    """pixels that are fluid in at least one frame; None: those of the mask"""
 
 
 class BodyBuilder(Protocol):

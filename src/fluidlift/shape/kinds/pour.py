@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from fluidlift.shape import depth_surface, surface
-from fluidlift.shape.filled_vessel import distance_ahead, find_vessel, pool_depths
+from fluidlift.shape.filled_vessel import distance_ahead, pool_depths, vessel_of
 from fluidlift.shape.kinds.base import Observation
 from fluidlift.shape.looked_into import jet_rows
 from fluidlift.shape.surface import FrontSurface
@@ -58,7 +58,8 @@ class _Pour:
 def _with_pool(front: FrontSurface, seen: Observation) -> FrontSurface:
     """The surface of a pour, with what stands in a vessel below its jet as a solid of revolution."""
     camera, mask = seen.camera, seen.mask
-    vessel = find_vessel(camera, mask, distance_ahead(camera, mask, front.depth + front.half_thickness), seen.rims)
+    ahead = distance_ahead(camera, mask, front.depth + front.half_thickness)
+    vessel = vessel_of(camera, mask, mask if seen.ever is None else seen.ever, ahead, seen.rims)
     if vessel is None:
         return front
     near, far = pool_depths(camera, mask, vessel)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from fluidlift.shape.jets import JetOutline
-from fluidlift.shape.puddle import down_to_landing, jet_over_pool, jets_into_puddle
+from fluidlift.shape.puddle import down_to_landing, grows_taller, jet_over_pool, jets_into_puddle
 from fluidlift.types import PinholeCamera, UpEvidence
 
 H, W = 160, 160
@@ -73,3 +73,13 @@ def test_a_jet_goes_on_over_the_way_on_which_its_flow_is_lost(below, reach):
     drawn = down_to_landing(outline, np.ones((H, W), bool), motion, np.where(pixels, 0.8, below))
     assert drawn.centers[-1][1] == pytest.approx(90.0 + reach, abs=1e-6)
     assert drawn.pixels.any(axis=1).sum() == pytest.approx(90 + reach, abs=1)
+
+
+def test_what_fills_a_glass_gets_taller_and_a_puddle_stays_as_flat_as_it_is_seen():
+    found = jets_into_puddle(CAMERA, None, *scene(pool(20.0)))
+    assert found is not None
+    spread = ((COL - 80) / 65.0) ** 2 + ((ROW - 106) / 26.0) ** 2 < 1
+    glass = (np.abs(COL - 80) < 50) & (ROW > 40) & (ROW < 100)
+    sways = JET | np.roll(JET, 6, axis=1)
+    assert not grows_taller(found, JET | pool(20.0)) and not grows_taller(found, sways | spread)
+    assert grows_taller(found, sways | pool(20.0) | glass)

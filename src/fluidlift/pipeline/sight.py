@@ -407,7 +407,8 @@ def _kind_and_up(
         parts = composite.split(kind, known, tilt, mask, motion, trust)
         if c.kind == "auto" and (kind.fills_vessel or kinds.spreads(evidence)):
             poured = puddle.jet_over_pool(tilt, mask) or puddle.jets_into_puddle(known, tilt, mask, motion, trust)
-            if poured is not None and not filled_vessel.in_vessel(said.rims or looked.rims, poured.lying):
+            stays = poured is not None and not filled_vessel.in_vessel(said.rims or looked.rims, poured.lying)
+            if poured is not None and stays and not puddle.grows_taller(poured, fluid.any_frame()):
                 kind, parts = STREAM, composite.BodyParts(poured.jets, poured.lying, puddle=True)
     else:
         parts = composite.BodyParts((), mask)

@@ -78,13 +78,14 @@ class Arrivals:
             possible: where fluid may be. What is held to be solid and comes with the fluid for the most part is its
                 level.
         """
-        count, parts = cv2.connectedComponents((~possible).astype(np.uint8), connectivity=4)
+        count, found = cv2.connectedComponents((~possible).astype(np.uint8), connectivity=4)
+        parts = np.asarray(found, np.int64)
         rises = np.bincount(parts[self.where], minlength=count) > 0.5 * np.bincount(parts.ravel(), minlength=count)
-        possible = possible | (rises[parts] & ~possible)
+        risen = rises[parts] & ~possible
         wet, sure = np.where(self.where[..., None], self.wet, evidence.typical), region | self.where
-        found = with_quiet_water(wet.astype(np.float32), np.where(rises[parts], 0.0, score), sure)
-        found = ndimage.binary_fill_holes(found | sure)
-        return sure | (found & possible & self.and_below)
+        grown = with_quiet_water(wet.astype(np.float32), np.where(risen, 0.0, score), sure)
+        grown = ndimage.binary_fill_holes(grown | sure)
+        return sure | (grown & (possible | risen) & self.and_below)
 
 
 def arrivals(evidence: Evidence, region: Bool[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"]) -> Arrivals | None:
@@ -127,9 +128,9 @@ def _two_looks(
     """Means before and after the instant that parts the looks of each place best (least squares), the first picture
     after it, and whether what is left beside the means is little."""
     count = len(seen)
-    total = np.cumsum(seen, axis=0, dtype=np.float32)
-    best = np.full(seen.shape[1:3], -1.0, np.float32)
-    first, second = np.zeros((2, *seen.shape[1:]), np.float32)
+    total: np.ndarray = np.cumsum(seen, axis=0, dtype=np.float32)
+    best: np.ndarray = np.full(seen.shape[1:3], -1.0, np.float32)
+    first, second = np.zeros(seen.shape[1:], np.float32), np.zeros(seen.shape[1:], np.float32)
     when = np.zeros(seen.shape[1:3], np.int64)
     for k in range(1, count):
         one, other = total[k - 1] / k, (total[-1] - total[k - 1]) / (count - k)
@@ -147,7 +148,8 @@ def _rising(
 ) -> tuple[Bool[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
     """The pieces that are large enough, are part of a region for the most part, and come from below upwards; and the
     number of the piece of each pixel."""
-    count, parts = cv2.connectedComponents(where.astype(np.uint8), connectivity=4)
+    count, found = cv2.connectedComponents(where.astype(np.uint8), connectivity=4)
+    parts = np.asarray(found, np.int64)
     size = np.bincount(parts.ravel(), minlength=count)
     kept = (size >= LEAST * where.size) & (np.bincount(parts[region], minlength=count) > 0.5 * size)
     kept[0] = False

@@ -253,3 +253,14 @@ def test_a_heap_that_does_not_become_more_is_in_no_vessel():
     low[: np.argmax(heap.sum(axis=1) > 60) + 12, :] = False  # its top is hidden now, and the jet with it
     assert find_vessel(camera, low, AWAY) is None and find_vessel(camera, sways, AWAY) is not None
     assert vessel_of(camera, low, sways, AWAY) is None
+
+
+def test_a_glass_draws_in_below_its_level_no_more_than_the_tilt_may_err():
+    seen, known = camera_at(14.0), camera_at(4.0)
+    full = made(14.0, level=0.3)
+    now = FilledVessel(full.axis, full.heights, full.radii, full.floor)
+    mask, ever = silhouette(seen, now), silhouette(seen, now) | silhouette(seen, full)
+    found = vessel_of(known, mask, ever, AWAY)
+    assert found is not None and found.nearly_empty
+    higher = seen_higher(found, known, ever)
+    assert (higher.radii[higher.heights > 0.5 * (higher.floor + higher.heights[-1])] > 0.23).all()

@@ -64,6 +64,8 @@ pool's own"""
 FAR_WALL = 0.15
 """of the far half of a rim's disc, from which what a pool leaves free there and not on the near side is wall above it:
 outlines of pools err by a few hundredths, on all sides (a choice)"""
+ARC = 0.35
+"""radii, half of how tall the surface of what a vessel holds looks from 20 degrees above: as far as tilts err"""
 FILLED = 0.5
 """of how high a vessel is ever seen filled, to which it is at first at most where only that tells it: what does not
 become more is a heap (a choice)"""
@@ -245,12 +247,23 @@ def vessel_of(
     later = find_vessel(camera, ever, distance, rims, mouth)
     if later is None or later.looked_into:
         return found
+    later = _upright_at_level(later)
     level = level_in(later, camera, mask)
     share = (level - later.floor) / (later.level - later.floor)
     if share > FILLED:
         return found
     heights = np.linspace(later.floor, level, max(int(share * len(later.heights)), 2))
     return replace(later, heights=heights, radii=later.radius_at(heights), level=level, nearly_empty=True)
+
+
+def _upright_at_level(vessel: FilledVessel) -> FilledVessel:
+    """With a wall that does not draw in over the last bit below its level: there the silhouette is the far arc of the
+    surface as well, which is taller than it should be where the camera looks down by more than is known."""
+    beyond = vessel.heights > vessel.level - ARC * vessel.radii.max()
+    if beyond.all():
+        return vessel
+    least = np.where(beyond, vessel.radii[~beyond][-1], 0.0)
+    return replace(vessel, radii=np.maximum(vessel.radii, least))
 
 
 def level_in(vessel: FilledVessel, camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]) -> float:
@@ -365,6 +378,7 @@ def seen_higher(vessel: FilledVessel, camera: PinholeCamera, ever: Bool[np.ndarr
     found = find_vessel(camera, ever, _ahead(vessel, camera))
     if found is None:
         return vessel
+    found = _upright_at_level(found)
     above = found.heights > vessel.level
     ragged = (vessel.heights > vessel.heights[np.argmax(vessel.radii)]) & (vessel.heights < found.heights[-1])
     first = np.where(ragged, np.maximum(vessel.radii, found.radius_at(vessel.heights)), vessel.radii)

@@ -140,3 +140,12 @@ def test_what_rises_with_no_jet_above_it_is_told_as_smoke_is():
     clues = clues_of(clip, flow_of(clip))
     assert arrivals(clues.evidence, clues.bed.region, clues.inside) is not None
     assert clues.arrivals is None and clues.advances
+
+
+def test_a_person_who_says_that_it_is_none_is_believed():
+    clip, fluid = clip_of()
+    flow, place = flow_of(clip), (115, 105)  # in the glass, beside the jet
+    assert (segment(clip, flow).labels[-1] == Label.FLUID)[place[1], place[0]]
+    labels = segment(clip, flow, points=[(*place, 0)]).labels
+    assert not (labels[:, place[1] - 2 : place[1] + 3, place[0] - 2 : place[0] + 3] == Label.FLUID).any()
+    assert ((labels[-1] == Label.FLUID) & fluid[-1])[:60].any()

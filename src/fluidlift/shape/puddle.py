@@ -25,7 +25,7 @@ LEAST_SHARE = 0.4
 """share of the fluid that is in the pool, at least"""
 UPRIGHT = 1.5
 """how many times taller than the tilt would show it a round pool may be, where the tilt is known, and than it was at
-first: a taller one is no level surface (`POOL_SPREAD` at 95 %). Made glasses that fill get 1.3 to 4 times as tall, a
+first: a taller one is no level surface (`POOL_SPREAD` at 95 %). Made glasses that fill get 1.25 to 4 times as tall, a
 cup that is looked into 1.26"""
 
 

@@ -333,7 +333,9 @@ def staying_labels(known: Clues, clicks: Clicks) -> Iterator[tuple[np.ndarray, n
         clicks: what a person said of some pixels.
     """
     evidence, score, presence, grown = known.evidence, known.score, known.presence, known.grown
-    region, rocks, washed = known.bed.region, known.bed.rocks, known.bed.washed
+    region, rocks, washed, arriving = known.bed.region, known.bed.rocks, known.bed.washed, known.arrivals
+    if arriving is not None:
+        region = arriving.with_what_was_there(evidence, score, region, known.inside & ~known.solids) & ~rocks
     asked = held = np.zeros_like(region)
     if clicks:
         before = region
@@ -346,9 +348,7 @@ def staying_labels(known: Clues, clicks: Clicks) -> Iterator[tuple[np.ndarray, n
         presence, still = always(presence), np.zeros_like(still)
     elif known.jets is not None:  # a heap lies still where it has been poured: it neither leaves nor is a rock
         presence, still = remaining(presence), np.zeros_like(still)
-    arriving = known.arrivals
     if arriving is not None:  # the change tells when, and activity near it does not; what is as still is no rock
-        region = arriving.with_what_was_there(evidence, score, region, known.inside & ~known.solids) & ~asked & ~rocks
         presence, still = always(presence, arriving.and_below), np.zeros_like(still)
     still = still | asked | rocks
     found = lasting_labels(known.told, region, still, presence)

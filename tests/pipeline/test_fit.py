@@ -12,7 +12,9 @@ from fluidlift.pipeline.stages import fit as stage
 from fluidlift.shape.filled_vessel import FilledVessel, pool_depths
 from fluidlift.shape.kind import level_camera
 from fluidlift.types import (
+    GRAVITY,
     CellType,
+    Coat,
     Estimate,
     FaceVelocity,
     FluidParameters,
@@ -49,7 +51,8 @@ def flow(u, v=0.0, w=0.0):
 def body(kind, cells=None):
     """What counts of a geometry with these cells."""
     terrain = SimpleNamespace(grid=GRID, mainstream=X)
-    setting = SimpleNamespace(cell_types=channel() if cells is None else cells, terrain=terrain, pool_level=None)
+    cells = channel() if cells is None else cells
+    setting = SimpleNamespace(cell_types=cells, terrain=terrain, pool_level=None, coat=None)
     return SimpleNamespace(kind=kind, setting=setting)
 
 
@@ -216,3 +219,45 @@ def test_water_slips_over_its_bed_and_a_viscous_film_sticks_to_it():
     assert stick(0.0, 0.0, 1.0) == water  # one frame of three is an outlier
     assert stick(1.0, 1.0, 0.9) == 1.0
     assert water < stick(0.5) < 0.5
+
+
+COAT = Coat(0.12, 0.2, 0.03)
+"""a film of 3 cm around something 0.2 m in radius, whose top is 0.12 m above the eye"""
+
+
+def test_a_film_runs_down_as_it_is_seen_to_or_as_fast_as_it_has_to():
+    # Nusselt's film: g d^2 / (3 nu) in the mean
+    assert GRAVITY * COAT.thickness**2 / (3 * stage.film_viscosity(COAT, 1.0, 0.05)) == pytest.approx(0.05)
+    nu = stage.film_viscosity(COAT, 2e-4, None)
+    carried = GRAVITY * COAT.thickness**3 / (3 * nu) * 2 * np.pi * COAT.radius
+    assert carried == pytest.approx(2e-4)
+    assert np.isfinite(stage.film_viscosity(COAT, 0.0, None))
+
+
+def test_the_film_on_what_a_pour_covers_is_told_from_its_jet_by_its_height():
+    camera = level_camera(PinholeCamera.from_fov(40.0, (60, 60)), UpEvidence(0.0, 0.0, "", 0.0))
+    mask = np.zeros((60, 60), bool)
+    mask[5:50, 25:35] = True  # 1 m high in 2 m, the upper half of it a jet
+    flow = np.zeros((60, 60, 2))
+    flow[..., 1] = np.where(np.arange(60) < 25, 6.0, 1.5)[:, None]
+    trust = np.where(mask, 0.9, 0.0)
+    seen = SimpleNamespace(
+        camera=camera, depth=np.full((60, 60), 2.0), mask=mask, mean_flow=flow, mean_confidence=trust
+    )
+    speed = stage.coat_speed(seen, COAT, INTERVAL)
+    assert speed == pytest.approx(1.5 * 2.0 / camera.focal[0] / INTERVAL, rel=1e-6)
+    seen.mean_confidence = np.where(np.arange(60) > 40, 0.9, 0.0)[:, None] * mask
+    assert stage.coat_speed(seen, COAT, INTERVAL) is None, "most of it is not seen"
+
+
+def test_a_pour_that_covers_something_is_as_viscous_as_its_film_needs_and_never_less_than_usual(monkeypatch):
+    cells, scene = channel(), body("pour")
+    scene.setting.coat = COAT
+    for seen, expected in ((0.01, stage.film_viscosity(COAT, 0.0, 0.01)), (1e9, kind_of("pour").kinematic_viscosity)):
+        monkeypatch.setattr(stage, "coat_speed", lambda *_, at=seen: at)
+        found = stage.first_guess(scene, [flow(1.0)], INTERVAL, None)
+        assert found.kinematic_viscosity == pytest.approx(expected)
+    monkeypatch.setattr(stage, "coat_speed", lambda *_: None)
+    section = GRID.spacing**2 * (cells[0] == CellType.INFLOW).sum()
+    found = stage.first_guess(scene, [flow(0.1)], INTERVAL, None)
+    assert found.kinematic_viscosity == pytest.approx(stage.film_viscosity(COAT, 0.1 * section, None), rel=1e-5)

@@ -13,7 +13,7 @@ from fluidlift.errors import require
 from fluidlift.look.surface_map import sampled
 from fluidlift.numerics.mirror import folded
 from fluidlift.numerics.sharing import shared
-from fluidlift.types.fluid_masks import share_that_stays
+from fluidlift.types.fluid_masks import outline_grows
 
 BROAD = 0.03
 """standard deviation of the blur that separates the shade of a place from its fine look, shares of the picture's longer
@@ -99,9 +99,9 @@ class FluidFootage:
         return len(self.frames)
 
     @property
-    def stays(self) -> float:
-        """`share_that_stays` of its fluid."""
-        return share_that_stays(self.fluid)
+    def grows(self) -> bool:
+        """`outline_grows` of its fluid."""
+        return outline_grows(self.fluid)
 
     def within(self, index: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Row and column in the picture of places in it or beside it: beyond its sides lies its mirror image.

@@ -43,7 +43,7 @@ def motion_scene(clip: VideoClip, geometry: Geometry) -> MotionScene:
         trust = np.where(near_occluders(g.hidden), np.float32(0), trust)
     return MotionScene(
         g.camera, g.sighted_depth, setting.terrain, setting.cell_types, g.kind, clip.interval, setting.surface_height,
-        setting.pool_level, flights=flights_of(geometry), prior=(g.mean_flow, trust),
+        setting.held_below, flights=flights_of(geometry), prior=(g.mean_flow, trust),
         slope_error=0.0 if g.slope is None else float(np.tan(np.radians(min(g.slope.error, 45.0)))),
     )  # fmt: skip
 

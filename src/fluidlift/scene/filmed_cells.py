@@ -20,7 +20,7 @@ from scipy import ndimage
 from fluidlift.errors import require
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.types import CellType, FluidKind, Grid, PinholeCamera, Terrain
-from fluidlift.types.fluid_masks import STAYS, FluidMasks, share_that_stays
+from fluidlift.types.fluid_masks import STAYS, FluidMasks, outline_grows, share_that_stays
 
 MARGIN = 1.0
 """cells from the filmed fluid, as the camera sees them: a simulated rim lies somewhere in a cell"""
@@ -35,19 +35,20 @@ def filmed_shares(
 ) -> tuple[Float[np.ndarray, "h w"] | None, float]:  # fmt: skip
     """Share of a clip's frames in which each pixel is fluid, and for how long (s) what is dry in all of them stays so.
 
-    The outline of what lies on ground or falls steadily stays as it was filmed. One that grows, as that of a vessel
-    which fills, goes on to do so after its clip. Nothing (None) is said of what collapses: no inlet would make up for
-    fluid that was taken out.
+    The outline of what lies on ground, falls steadily or sways about stays as it was filmed. One that grows, as that
+    of a vessel which fills, goes on to do so after its clip. Nothing (None) is said of what collapses: no inlet would
+    make up for fluid that was taken out.
 
     Args:
         kind: of the fluid.
         masks: of the clip.
         left: s of the clip from the body at rest on.
     """
-    stays = kind.lies_on_ground or share_that_stays(masks) > STAYS
-    if kind.starts_at_rest and not stays:
+    if kind.lies_on_ground:
+        return masks.shares(), math.inf
+    if kind.starts_at_rest and share_that_stays(masks) <= STAYS:
         return None, math.inf
-    return masks.shares(), math.inf if stays else left
+    return masks.shares(), left if outline_grows(masks) else math.inf
 
 
 def dry_cells(

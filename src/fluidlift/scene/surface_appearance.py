@@ -19,7 +19,6 @@ from fluidlift.errors import InputRejected
 from fluidlift.messages import Notice
 from fluidlift.scene.simulator import lends_look
 from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, kind_of, sh_from_rgb
-from fluidlift.types.fluid_masks import STAYS
 from fluidlift.types.rows import rows
 
 if TYPE_CHECKING:
@@ -55,7 +54,7 @@ meet, the motion of the film breaks off. Of 0.12, 0.3 and 0.6 a fall's current i
 clip 0.64, 0.50 and 0.35)"""
 
 LATER = 0.5
-"""share of a film from which it begins anew where its fluid changed its place (a vessel that fills): the later half is
+"""share of a film from which it begins anew where its fluid grew (a vessel that fills): the later half is
 nearer to where the fluid is then"""
 
 FEWEST_CELLS = 4.0
@@ -265,11 +264,11 @@ class SurfaceAppearance:
         radius = AT_HOME if footage is not None and not scene.edited else PATCH
         # a jet is one thing: pieces of it from different instants do not fit together where it sways
         pours = (kind.rises_from_pool or not kind.lies_on_ground) and not scene.edited
-        changes = pours and footage is not None and footage.stays < STAYS
+        grows = pours and footage is not None and footage.grows
         self._patches = TexturePatches(
             texture, max(radius * across, FEWEST_CELLS * self._cell), footage=footage,
             edited=scene.edited and not stands, start=scene.film_start, together=stands or pours,
-            again=LATER * len(footage) if changes and footage is not None else 0.0,
+            again=LATER * len(footage) if grows and footage is not None else 0.0,
         )  # fmt: skip
         if footage is not None and stands and not scene.edited:
             self._level = float(np.median(surface.height[surface.wet]))
@@ -277,7 +276,7 @@ class SurfaceAppearance:
             if not (pours or stands):
                 self._outline, self._sways = FilmedOutline(self._camera, footage.outside, self._cell), True
             else:
-                self._outlines = FilmedOutlines(self._camera, footage, self._cell, rises=changes)
+                self._outlines = FilmedOutlines(self._camera, footage, self._cell, rises=grows)
                 self._outline = self._outlines.at(scene.film_start)
                 self._pace = scene.interval / footage.interval
         self._plays = footage is not None

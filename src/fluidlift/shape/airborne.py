@@ -10,10 +10,11 @@ from jaxtyping import Bool, Float
 
 from fluidlift.errors import require
 from fluidlift.shape.filled_vessel import FilledVessel
+from fluidlift.shape.heap import THICKEST, Heap
 from fluidlift.shape.jet_column import Jet
 from fluidlift.shape.kinds import AirborneBuilder, builder_of
 from fluidlift.shape.terrain import at_cells, terrain_mesh, unit
-from fluidlift.types import CellType, FluidKind, Grid, PinholeCamera, Setting, Terrain, kind_of
+from fluidlift.types import CellType, Coat, FluidKind, Grid, PinholeCamera, Setting, Terrain, kind_of
 
 PASSING = 0.25
 """speed along the stream at one of its ends over that of its swift part (90th percentile), above which fluid enters or
@@ -21,6 +22,8 @@ leaves there. On the cases at hand dead ends have 0.1 to 0.2 of it, live ones 0.
 WALL = 2.4
 """cells that the wall of a vessel is thick: one leaves no gap for steps from cell to cell, the rest is for a distance
 that is of the first order (a choice)"""
+FILM = 2.0
+"""cells of liquid on what a heap covers: one is no layer that can flow"""
 NOZZLE, NARROWEST = 0.25, 1.2
 """radius of what a fountain rises out of over that of what it lands in, and in cells: what rises takes a sixteenth of
 the section that what falls has (a choice, real nozzles are thinner than any cell); a cell alone lets nothing through"""
@@ -43,8 +46,9 @@ def airborne_setting(
     longest: int,
     cell_limit: int,
     vessel: FilledVessel | None = None,
+    heap: Heap | None = None,
 ) -> Setting:
-    """A jet or a plume: free in the air above a floor, and the vessel in which its lower part stands.
+    """A jet or a plume: free in the air above a floor, and the vessel in which its lower part stands, or what it coats.
 
     Args:
         front: camera depth of the near side, m.
@@ -57,6 +61,7 @@ def airborne_setting(
         longest: cells along the longest side.
         cell_limit: most cells of the grid.
         vessel: in the world, m; it stands on the floor.
+        heap: in the world, m; what it covers stands on the floor.
 
     Raises:
         ValueError: a kind that is not in the air.
@@ -85,10 +90,13 @@ def airborne_setting(
     nodes, centers = grid.nodes(), grid.centers()
     floor = low[2] if vessel is not None else low[2] - 0.5 * h
     phi = nodes[..., 2] - floor
-    body_cells = inside_body(centers.reshape(-1, 3), front, back, mask, camera).reshape(grid.shape)
+    coat, body_cells = None, inside_body(centers.reshape(-1, 3), front, back, mask, camera).reshape(grid.shape)
     if vessel is not None:
         phi = np.minimum(phi, vessel.wall(nodes, WALL * h))
         body_cells |= vessel.holds(centers)
+    if heap is not None:
+        phi = np.minimum(phi, heap.core(nodes, FILM * h))
+        coat = Coat(float(heap.heights[-1]), float(heap.radii[0]), min(FILM * h, THICKEST * float(heap.radii[0])))
     solid = at_cells(phi) < 0
     fluid = body_cells & ~solid
     cells = np.full(grid.shape, CellType.EMPTY, np.uint8)
@@ -97,11 +105,11 @@ def airborne_setting(
     if fluid.any():
         cells[builder.inlet(fluid, centers[..., 2], h) & ~solid] = CellType.INFLOW
     cells[builder.outlet(grid.shape) & ~solid] = CellType.OUTFLOW
-    opaque = vessel is not None and vessel.looked_into
+    opaque = coat is not None or (vessel is not None and vessel.looked_into)
     terrain = Terrain(grid, phi.astype(np.float32), unit(mainstream), terrain_mesh(grid, phi), opaque)
     bed = np.full(grid.shape[:2], floor)
     level, mouth = (None, None) if vessel is None else (vessel.level, vessel.mouth)
-    return Setting(terrain, cells, None, bed, level, mouth)
+    return Setting(terrain, cells, None, bed, level, mouth, coat)
 
 
 def inside_body(

@@ -8,7 +8,8 @@ from scipy.ndimage import convolve1d
 
 from fluidlift.shape.background import colour_bins
 from fluidlift.shape.evidence import Evidence
-from fluidlift.shape.min_cut import edge_weights, min_cut
+from fluidlift.shape.looked_into import jet_rows
+from fluidlift.shape.min_cut import disc, edge_weights, min_cut
 
 STIFFNESS = 4.0
 """log odds per px of outline in a smooth place"""
@@ -30,6 +31,12 @@ SCARCE = 1.0
 """log odds against fluid of a place that does not stream"""
 CLEAR = 2.0
 """weight of colour against streaming, which marks few places"""
+AROUND = 0.02
+"""part of the longer side by which what a jet has poured may reach beyond the hull of what moves: its rim creeps"""
+JET = 1.0 / 6.0
+"""of the height of a pour that its jet takes, at least (as `rectified.PARTS`)"""
+FALLS = 0.5
+"""part of a jet that streams, at least; of what lies below it, at most"""
 SEEDED = 0.25
 """parts with fewer seeds than this share of the best part's are not the fluid"""
 
@@ -110,3 +117,34 @@ def grown_from_streams(evidence: Evidence, inside: np.ndarray, *, rounds: int = 
             break
         before, fluid, other = found, found + 2.0 * seeds, (~found).astype(np.float32)
     return before if before is not None and before.any() else None
+
+
+def still_below_jet(evidence: Evidence, region: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """bool [h,w]: what has the colours of a jet, lies below it between what moves, and does not move itself.
+
+    What is thick and smooth lies still where it was poured: only its jet and its rim are seen to move. Both are the
+    fluid, and what they enclose is it as well where it looks like them.
+
+    Args:
+        evidence: of the clip.
+        region: bool [h,w], what motion and edges gave.
+        inside: bool [h,w], where to look.
+    """
+    none = np.zeros_like(region)
+    if not region.any():
+        return none
+    hull = np.zeros(region.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(region)[:, ::-1].astype(np.int32)), 1)
+    near = cv2.dilate(hull, disc(AROUND * max(region.shape))) > 0
+    grown = grown_from_streams(evidence, inside & near)
+    if grown is None:
+        return none
+    jet = jet_rows(grown)
+    rows, below = jet.any(axis=1), grown & ~jet
+    if rows.sum() < JET * grown.any(axis=1).sum() or not below.any():
+        return none
+    streams = evidence.streaming > DIRECT
+    if streams[jet].mean() < FALLS or streams[below].mean() > FALLS:
+        return none
+    below[: int(np.flatnonzero(rows)[-1]) + 1] = False  # what it falls from may have its colours, too
+    return below & ~region

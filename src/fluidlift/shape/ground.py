@@ -66,6 +66,7 @@ def setting_around(
         # smoke needs the whole box, and is cheap per cell: no free surface, few particles
         kind=kind, longest=c.cells, cell_limit=c.cell_limit * (2 if kind_of(kind).is_gas else 1),
         vessel=None if vessel is None else seen_higher(vessel.transformed(to_world), camera, later),
+        heap=None if front.heap is None else front.heap.transformed(to_world),
     )  # fmt: skip
 
 

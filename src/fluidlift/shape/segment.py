@@ -24,7 +24,7 @@ from fluidlift.messages import Notice
 from fluidlift.shape.background import in_own_colours
 from fluidlift.shape.carried_layers import by_either, carried_layers
 from fluidlift.shape.change_points import Arrivals, arrivals, bare_before
-from fluidlift.shape.colour_growth import grown_from_streams, with_quiet_water
+from fluidlift.shape.colour_growth import grown_from_streams, still_below_jet, with_quiet_water
 from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence, pair_reader, solids_by_flow
 from fluidlift.shape.frame_pictures import working_size
 from fluidlift.shape.hints import VOICE, Clicks, Point, clicks_at, heed, holes_asked_for
@@ -197,6 +197,13 @@ class Clues:
         return found if early else None
 
     @cached_property
+    def heap(self) -> np.ndarray:
+        """bool [h,w], what lies still where it has been poured; nothing where change or a horizon tells otherwise."""
+        if self.grown is not None or self.horizon is not None:
+            return np.zeros(self.score.shape, bool)
+        return still_below_jet(self.evidence, self._without_plants, self.inside & ~self.solids)
+
+    @cached_property
     def vessels(self) -> tuple[Vessel, ...]:
         """Those that hold a liquid."""
         return () if self.horizon is not None else filled_vessels(self.evidence, self.solids)
@@ -222,7 +229,7 @@ class Clues:
         taken = self._first & ~region  # plants and washed ground wander, too, and were told from water already
         barred = rocks | self.solids | taken | ~self.inside
         region = with_quiet_reaches(evidence, with_open_water(evidence, region, barred), barred)
-        return Bed(region, rocks, washed)
+        return Bed(clean_region(region | self.heap), rocks & ~self.heap, washed)
 
 
 def clues_of(
@@ -350,6 +357,8 @@ def staying_labels(known: Clues, clicks: Clicks) -> Iterator[tuple[np.ndarray, n
         presence, still = remaining(presence), np.zeros_like(still)
     if arriving is not None:  # the change tells when, and activity near it does not; what is as still is no rock
         presence, still = always(presence, arriving.and_below), np.zeros_like(still)
+    if known.heap.any():
+        presence, still = always(presence, known.heap), still & ~known.heap
     still = still | asked | rocks
     found = lasting_labels(known.told, region, still, presence)
     if grown is None:

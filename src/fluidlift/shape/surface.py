@@ -16,6 +16,7 @@ from fluidlift.errors import InputRejected, require
 from fluidlift.shape import chute, sections, slope
 from fluidlift.shape.energy_line import Channel, energy_profile
 from fluidlift.shape.filled_vessel import FilledVessel
+from fluidlift.shape.heap import Heap
 from fluidlift.shape.heights import (
     FARTHEST,
     FOOT,
@@ -47,6 +48,8 @@ class FrontSurface:
     """pixels of each chute that comes down onto it"""
     vessel: FilledVessel | None = None
     """that holds its lower part"""
+    heap: Heap | None = None
+    """that it forms on something"""
 
     @property
     def sighted(self) -> Float[np.ndarray, "h w"]:

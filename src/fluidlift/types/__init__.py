@@ -37,7 +37,7 @@ from fluidlift.types.kind import KINDS, FluidKind, kind_of
 from fluidlift.types.parameters import GRAVITY, Estimate, FluidParameters
 from fluidlift.types.particles import Particles
 from fluidlift.types.results import FitResult, SolveReport
-from fluidlift.types.terrain import Setting, Terrain, TriangleMesh, VesselRim
+from fluidlift.types.terrain import Coat, Setting, Terrain, TriangleMesh, VesselRim
 from fluidlift.types.transforms import RigidTransform, Similarity3, matrix_from_quat, quat_from_matrix
 
 __all__ = [
@@ -48,6 +48,7 @@ __all__ = [
     "BedEvidence",
     "CameraPath",
     "CellType",
+    "Coat",
     "Estimate",
     "FaceVelocity",
     "Filmed",

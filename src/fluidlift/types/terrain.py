@@ -46,6 +46,18 @@ class VesselRim:
 
 
 @dataclass(frozen=True)
+class Coat:
+    """What a pour forms on something that it covers: a film around a solid of revolution."""
+
+    top: float
+    """z of its highest point, m"""
+    radius: float
+    """of its outside at its lower end, m"""
+    thickness: float
+    """m"""
+
+
+@dataclass(frozen=True)
 class Terrain:
     """Bed, banks and rocks."""
 
@@ -57,7 +69,7 @@ class Terrain:
     mesh: TriangleMesh
     """the surface of the solid, for pictures and export"""
     opaque: bool = False
-    """of a pour: its vessel hides what it holds, where glass does not"""
+    """of a pour: its vessel, or what it covers, hides what is in or behind it, where glass does not"""
 
     def __post_init__(self) -> None:
         shape = tuple(n + 1 for n in self.grid.shape)
@@ -79,3 +91,10 @@ class Setting:
     """z below which a pour stands in its vessel, m"""
     rim: VesselRim | None = None
     """of that vessel where it is looked into, m"""
+    coat: Coat | None = None
+    """of a pour that covers something"""
+
+    @property
+    def held_below(self) -> float | None:
+        """z below which a pour is held by something, and does not fall, m; None: it falls throughout."""
+        return self.pool_level if self.coat is None else self.coat.top

@@ -26,7 +26,18 @@ from fluidlift.fit.rising import outline_rises, with_buoyancy
 from fluidlift.machine import one_torch_thread
 from fluidlift.pipeline.fit_request import FitRequest, request_of, startable
 from fluidlift.pipeline.work import Work
-from fluidlift.types import CellType, Estimate, FaceVelocity, FitResult, FluidKind, FluidParameters, kind_of
+from fluidlift.types import (
+    GRAVITY,
+    CellType,
+    Coat,
+    Estimate,
+    FaceVelocity,
+    FitResult,
+    FluidKind,
+    FluidParameters,
+    kind_of,
+)
+from fluidlift.types.flow import TRUSTED
 from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Elsewhere, Fit, Geometry, Motion, Read, Segmentation
 
@@ -84,7 +95,8 @@ def fit(
     known = {name: getattr(initial, name) for name in request.held}
     parameters = replace(parameters, **known)
     if "wall_damping" not in (*free, *known):
-        parameters, estimates = _at_walls(parameters, estimates, sticking(kind, motion.reports))
+        coated = geometry.setting.coat is not None
+        parameters, estimates = _at_walls(parameters, estimates, 1.0 if coated else sticking(kind, motion.reports))
     estimates = {n: as_given(n, e, initial) if family(n) in known else e for n, e in estimates.items()}
     lift: dict[str, float] = {}
     if moved != free:
@@ -290,13 +302,18 @@ def first_guess(
     out = float((mean[outlet] @ direction).mean()) if outlet.any() else float((mean[wet] @ direction).mean())
     out = 0.0 if kind.is_standing_water else out
     speed = float(np.linalg.norm(mean[wet], axis=1).max()) if wet.any() else 0.0
+    # the mouth of the inlet is its cross-section across the stream, one layer of its cells
+    layer = setting.terrain.grid.spacing**2 * float(inlet.any(axis=int(np.argmax(np.abs(direction)))).sum())
     if filling is not None and inlet.any():
-        # the mouth of the inlet is its cross-section across the stream, one layer of its cells
-        layer = setting.terrain.grid.spacing**2 * float(inlet.any(axis=int(np.argmax(np.abs(direction)))).sum())
         bulk = direction * min(filling / layer, float(np.linalg.norm(bulk)))
+    viscosity = kind.kinematic_viscosity
+    if setting.coat is not None:  # the way of a jet's pattern to the side is its sway
+        bulk = direction * float(np.linalg.norm(bulk))
+        viscosity = max(viscosity, film_viscosity(setting.coat, layer * float(np.linalg.norm(bulk)),
+                                                  coat_speed(geometry, setting.coat, interval)))  # fmt: skip
     courant = setting.terrain.grid.spacing / max(speed, 1e-6)
     return FluidParameters(
-        kinematic_viscosity=kind.kinematic_viscosity,
+        kinematic_viscosity=viscosity,
         inflow_velocity=(float(bulk[0]), float(bulk[1]), float(bulk[2])),
         inflow_fluctuation=spread,
         outflow_velocity=max(out, 0.0),
@@ -304,6 +321,31 @@ def first_guess(
         wall_damping=kind.wall_damping,
         time_step=float(np.clip(min(interval, 2.0 * courant), interval / 20, interval)),
     )
+
+
+def film_viscosity(coat: Coat, discharge: float, speed: float | None) -> float:
+    """m^2/s with which a film on an upright wall runs down as it does: at g d^2 / (3 nu) in the mean (Nusselt 1916).
+
+    Args:
+        coat: the film.
+        discharge: m^3/s of the jet that it runs off with.
+        speed: at which it is seen to run, m/s; None: as fast as it has to.
+    """
+    if speed is None:
+        speed = discharge / (2.0 * np.pi * coat.radius * coat.thickness)
+    return GRAVITY * coat.thickness**2 / (3.0 * max(speed, 1e-6))
+
+
+def coat_speed(geometry: Geometry, coat: Coat, interval: float) -> float | None:
+    """Median speed (m/s) at which the film on what is covered is seen to run; None where most of it is not seen to."""
+    camera, depth = geometry.camera, geometry.depth
+    points = camera.unproject(camera.pixel_grid(), depth)
+    film = geometry.mask & (depth > 0) & (points[..., 2] < coat.top)
+    seen = film & (geometry.mean_confidence > TRUSTED)
+    if 2 * int(seen.sum()) < max(int(film.sum()), 1):
+        return None
+    way = np.linalg.norm(geometry.mean_flow, axis=-1) * depth / float(np.mean(camera.focal))
+    return float(np.median(way[seen])) / interval
 
 
 def inflow_unevenness(geometry: Geometry, targets: list[FaceVelocity]) -> float:

@@ -117,8 +117,9 @@ def _mainstream(s: Sighted) -> np.ndarray:
     """Canonical direction in which the body runs as a whole: as its jet, or what stands, is let go; else by its
     motion, beside what falls."""
     seen = s.seen
-    if s.front.vessel is not None:
-        return np.array(s.front.vessel.inflow)
+    held = s.front.vessel or s.front.heap
+    if held is not None:
+        return np.array(held.inflow)
     if seen.stood is not None:
         return seen.stood.direction
     lies, counted = ~s.falling.pixels[s.visible], seen.trust[s.visible]

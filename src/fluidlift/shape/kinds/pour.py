@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from fluidlift.shape import depth_surface, surface
 from fluidlift.shape.filled_vessel import distance_ahead, pool_depths, vessel_of
+from fluidlift.shape.heap import find_heap
 from fluidlift.shape.kinds.base import Observation
 from fluidlift.shape.looked_into import jet_rows
 from fluidlift.shape.surface import FrontSurface
@@ -61,7 +62,7 @@ def _with_pool(front: FrontSurface, seen: Observation) -> FrontSurface:
     ahead = distance_ahead(camera, mask, front.depth + front.half_thickness)
     vessel = vessel_of(camera, mask, mask if seen.ever is None else seen.ever, ahead, seen.rims)
     if vessel is None:
-        return front
+        return _over_heap(front, seen, ahead)
     near, far = pool_depths(camera, mask, vessel)
     held = np.isfinite(near)
     depth, half = np.where(held, near, front.depth), np.where(held, 0.5 * (far - near), front.half_thickness)
@@ -70,6 +71,20 @@ def _with_pool(front: FrontSurface, seen: Observation) -> FrontSurface:
         nearest = ndimage.distance_transform_edt(~held, return_distances=False, return_indices=True)
         depth, half = (np.where(edge, values[tuple(nearest)], values) for values in (depth, half))
     return replace(front, depth=depth.astype(np.float32), half_thickness=half.astype(np.float32), vessel=vessel)
+
+
+def _over_heap(front: FrontSurface, seen: Observation, ahead: float) -> FrontSurface:
+    """The surface of a pour, with what lies on something below its jet as a solid of revolution, and what runs down
+    from that on its near side."""
+    heap = find_heap(seen.camera, seen.mask, ahead)
+    if heap is None:
+        return front
+    near, far = heap.seen(seen.camera)
+    held = seen.mask & np.isfinite(near)
+    low = seen.camera.position[2] + near * seen.camera.rays(seen.camera.pixel_grid())[..., 2] < heap.heights[0]
+    half = np.where(low, front.half_thickness, 0.5 * (far - near))
+    depth, half = np.where(held, near, front.depth), np.where(held, half, front.half_thickness)
+    return replace(front, depth=depth.astype(np.float32), half_thickness=half.astype(np.float32), heap=heap)
 
 
 BUILDER = _Pour()

@@ -120,7 +120,9 @@ def test_an_outline_that_grows_is_known_to_the_end_of_its_clip_and_one_that_stay
     for t, frame in enumerate(labels):
         frame[25 - t : 25, 10:20] = Label.FLUID
     grows, stays = FluidMasks(labels), FluidMasks(labels[-1:].repeat(4, axis=0))
-    for kind, masks, dry_for in (("pour", grows, 0.8), ("pour", stays, np.inf), ("stream", grows, np.inf)):
+    sways = FluidMasks(np.stack([np.roll(labels[10], t, axis=1) for t in range(10)]))
+    for kind, masks, dry_for in (("pour", grows, 0.8), ("pour", stays, np.inf), ("stream", grows, np.inf),
+                                 ("pour", sways, np.inf)):  # fmt: skip
         shares, known = filmed_shares(kind_of(kind), masks, 0.8)
         assert known == dry_for
         np.testing.assert_array_equal(shares, masks.shares())

@@ -223,7 +223,7 @@ class Clues:
             found = with_quiet_reaches(evidence, found, barred | (self.horizon.below(found.shape) <= 0.0))
             return Bed(found, np.zeros_like(found))
         if self.jets is not None:  # what they pour lies still, and is no ground
-            return Bed(region, np.zeros_like(region))
+            return Bed(clean_region(region | self.heap), np.zeros_like(region))
         washed = washed_ground(evidence, region)
         region, rocks = without_ground(evidence, region)
         taken = self._first & ~region  # plants and washed ground wander, too, and were told from water already

@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from fluidlift.shape import depth_surface, surface
 from fluidlift.shape.filled_vessel import distance_ahead, pool_depths, vessel_of
-from fluidlift.shape.heap import find_heap
+from fluidlift.shape.heap import Heap, find_heap
 from fluidlift.shape.kinds.base import Observation
 from fluidlift.shape.looked_into import jet_rows
 from fluidlift.shape.surface import FrontSurface
@@ -57,12 +57,17 @@ class _Pour:
 
 
 def _with_pool(front: FrontSurface, seen: Observation) -> FrontSurface:
-    """The surface of a pour, with what stands in a vessel below its jet as a solid of revolution."""
+    """The surface of a pour, with what stands in a vessel below its jet, or lies on something, as a solid of
+    revolution."""
     camera, mask = seen.camera, seen.mask
-    ahead = distance_ahead(camera, mask, front.depth + front.half_thickness)
-    vessel = vessel_of(camera, mask, mask if seen.ever is None else seen.ever, ahead, seen.rims)
+    ahead, ever = distance_ahead(camera, mask, front.depth + front.half_thickness), seen.ever
+    ever = mask if ever is None else ever
+    heap = find_heap(camera, ever, ahead)  # what runs down from it may do so later
+    if heap is not None:
+        return _over_heap(front, seen, heap)
+    vessel = vessel_of(camera, mask, ever, ahead, seen.rims)
     if vessel is None:
-        return _over_heap(front, seen, ahead)
+        return front
     near, far = pool_depths(camera, mask, vessel)
     held = np.isfinite(near)
     depth, half = np.where(held, near, front.depth), np.where(held, 0.5 * (far - near), front.half_thickness)
@@ -73,12 +78,9 @@ def _with_pool(front: FrontSurface, seen: Observation) -> FrontSurface:
     return replace(front, depth=depth.astype(np.float32), half_thickness=half.astype(np.float32), vessel=vessel)
 
 
-def _over_heap(front: FrontSurface, seen: Observation, ahead: float) -> FrontSurface:
+def _over_heap(front: FrontSurface, seen: Observation, heap: Heap) -> FrontSurface:
     """The surface of a pour, with what lies on something below its jet as a solid of revolution, and what runs down
     from that on its near side."""
-    heap = find_heap(seen.camera, seen.mask, ahead)
-    if heap is None:
-        return front
     near, far = heap.seen(seen.camera)
     held = seen.mask & np.isfinite(near)
     low = seen.camera.position[2] + near * seen.camera.rays(seen.camera.pixel_grid())[..., 2] < heap.heights[0]

@@ -79,10 +79,21 @@ def test_it_moves_with_its_frame():
     assert moved.radius_at(np.array(3.0)) == pytest.approx(0.4)
 
 
-def observed(camera: PinholeCamera, mask: np.ndarray) -> Observation:
+def observed(camera: PinholeCamera, mask: np.ndarray, ever: np.ndarray | None = None) -> Observation:
     shape = mask.shape
     return Observation(camera, mask, np.zeros((*shape, 2)), np.zeros(shape), 1 / 30, None, False,
-                       SlopePrior(0.0, 1.0), 0.0, None)  # fmt: skip
+                       SlopePrior(0.0, 1.0), 0.0, None, ever=ever)  # fmt: skip
+
+
+def test_what_runs_down_later_tells_a_heap_from_what_stands_in_a_vessel():
+    camera, truth = camera_at(0.0), made()
+    mask, ever = silhouette(camera, truth, threads=0.0), silhouette(camera, truth)
+    later = BUILDER.front_surface(observed(camera, mask, ever))
+    assert later.heap is not None and later.vessel is None
+    (x, ahead), (x_true, away) = later.heap.axis, truth.axis
+    assert x / ahead == pytest.approx(x_true / away, abs=0.01)
+    never = BUILDER.front_surface(observed(camera, mask))
+    assert never.heap is None and never.vessel is not None
 
 
 def test_a_pour_that_covers_something_lies_around_it_and_is_fed_from_above():

@@ -36,8 +36,8 @@ AROUND = 0.02
 JET = 1.0 / 6.0
 """of the height of a pour that its jet takes, at least (as `rectified.PARTS`)"""
 FALLS, LIES = 0.05, 0.25
-"""part of a jet that streams, at least, and of that, what streams of what lies below it at most. Thin jets stream in
-specks: eight made ones in 0.10 to 0.78 of them, what they pour in 0.00 to 0.05; falls and their pools in 0.3 and more"""
+"""part of a jet that streams, at least, and share of that which may stream of what lies below it (a choice). Thin jets
+stream in specks: eight made ones in 0.10 to 0.80 of them, what they pour in 0.00 to 0.05"""
 FEW_ROUNDS = 3
 """in which colors are read anew within a small part of a picture: of 1, 2, 3 and 10, the first miss what glitters in
 two of eight made scenes, ten take what is poured on for the fluid in two"""

@@ -62,7 +62,7 @@ def _with_pool(front: FrontSurface, seen: Observation) -> FrontSurface:
     camera, mask = seen.camera, seen.mask
     ahead, ever = distance_ahead(camera, mask, front.depth + front.half_thickness), seen.ever
     ever = mask if ever is None else ever
-    heap = find_heap(camera, ever, ahead)  # what runs down from it may do so later
+    heap = find_heap(camera, mask, ahead) or find_heap(camera, ever, ahead)  # it may begin to run down later
     if heap is not None:
         return _over_heap(front, seen, heap)
     vessel = vessel_of(camera, mask, ever, ahead, seen.rims)

@@ -223,13 +223,16 @@ class Clues:
             found = with_quiet_reaches(evidence, found, barred | (self.horizon.below(found.shape) <= 0.0))
             return Bed(found, np.zeros_like(found))
         if self.jets is not None:  # what they pour lies still, and is no ground
-            return Bed(clean_region(region | self.heap), np.zeros_like(region))
+            return Bed(self._with_heap(region), np.zeros_like(region))
         washed = washed_ground(evidence, region)
         region, rocks = without_ground(evidence, region)
         taken = self._first & ~region  # plants and washed ground wander, too, and were told from water already
         barred = rocks | self.solids | taken | ~self.inside
         region = with_quiet_reaches(evidence, with_open_water(evidence, region, barred), barred)
-        return Bed(clean_region(region | self.heap), rocks & ~self.heap, washed)
+        return Bed(self._with_heap(region), rocks & ~self.heap, washed)
+
+    def _with_heap(self, region: np.ndarray) -> np.ndarray:
+        return clean_region(region | self.heap) if self.heap.any() else region
 
 
 def clues_of(

@@ -11,9 +11,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import array_shapes
+import hypothesis
 import numpy as np
 import pytest
 from catalogue import QUICK, Job, asset, stream_pictures, write_clip
+
+hypothesis.settings.register_profile("untimed", deadline=None)  # a machine that is busy is no failure
+hypothesis.settings.load_profile("untimed")
 
 HASTY = (
     "--set", "shape.cells=12", "--set", "shape.refine_iterations=0", "--set", "motion.targets=1",

@@ -76,7 +76,7 @@ def test_what_it_covers_lies_a_film_below_its_outside_and_goes_down_to_the_groun
 def test_it_moves_with_its_frame():
     moved = made(0.0).transformed(Similarity3(2.0, np.eye(3), np.array([1.0, 0.0, 3.0])))
     assert moved.axis == pytest.approx((1.0, 2 * AWAY)) and moved.heights[-1] == pytest.approx(2 * TOP + 3.0)
-    assert moved.radius_at(np.array(3.0)) == pytest.approx(0.4)
+    assert moved.radius_at(np.array([3.0])) == pytest.approx([0.4])
 
 
 def observed(camera: PinholeCamera, mask: np.ndarray, ever: np.ndarray | None = None) -> Observation:

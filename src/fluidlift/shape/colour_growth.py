@@ -135,7 +135,7 @@ def still_below_jet(evidence: Evidence, region: np.ndarray, inside: np.ndarray) 
         inside: bool [h,w], where to look.
     """
     none = np.zeros_like(region)
-    if not region.any():
+    if jet_rows(region).any(axis=1).sum() < max(JET * region.any(axis=1).sum(), 1):
         return none
     hull = np.zeros(region.shape, np.uint8)
     cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(region)[:, ::-1].astype(np.int32)), 1)

@@ -23,8 +23,6 @@ from fluidlift.shape.region import largest_piece
 from fluidlift.shape.view.roundness import IN_VESSEL, Ellipse
 from fluidlift.types import PinholeCamera, Similarity3, VesselRim, triple
 
-STEEPEST_VIEW = np.sin(np.radians(70.0))
-"""sine of the tilt from which no silhouette from the side is seen: walls are a third as high as they are"""
 SHALLOW = 0.05
 """radii between level and floor, below which the silhouette is that of the surface alone: no floor is seen"""
 DEEP = 1.0
@@ -171,10 +169,8 @@ def find_vessel(
         rims: of vessels that are seen. The one that holds the lower part of the silhouette tells its vessel.
         mouth: that one, where it is known.
     """
-    if abs(camera.camera_from_world.rotation[2, 2]) > STEEPEST_VIEW:
-        return None
     eye, (right, forward) = camera.position, level_axes(camera)
-    plane = Rectified.of(camera, mask, eye, right, forward, distance)
+    plane = Rectified.of(camera, mask, distance)
     if plane is None:
         return None
     if mouth is None:
@@ -263,9 +259,9 @@ def level_in(vessel: FilledVessel, camera: PinholeCamera, mask: Bool[np.ndarray,
         camera: that sees it.
         mask: fluid pixels.
     """
-    eye, (right, forward), distance = camera.position, level_axes(camera), _ahead(vessel, camera)
+    eye, distance = camera.position, _ahead(vessel, camera)
     least = vessel.floor + distance / max(camera.focal)
-    plane = Rectified.of(camera, mask, eye, right, forward, distance)
+    plane = Rectified.of(camera, mask, distance)
     if plane is None:
         return least
     wide = plane.width > 2.0 * NARROW * vessel.radius_at(plane.z + eye[2])

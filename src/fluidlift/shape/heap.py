@@ -93,7 +93,7 @@ def find_heap(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], distance: fl
         distance: from the camera to the axis along the ground, in the unit of the result.
     """
     eye, (right, forward) = camera.position, level_axes(camera)
-    plane = Rectified.of(camera, mask, eye, right, forward, distance)
+    plane = Rectified.of(camera, mask, distance)
     if plane is None:
         return None
     first, last = plane.pool()

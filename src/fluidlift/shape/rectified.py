@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from fluidlift.types import PinholeCamera
 
@@ -13,6 +14,8 @@ NARROW = 0.55
 wide above as below is none that stands in a vessel"""
 STEEPEST = np.tan(np.radians(15.0))
 """way to the side over height of a jet that leans, at most (`jets.ALONG`): what leans more is no jet alone"""
+STEEPEST_VIEW = np.sin(np.radians(70.0))
+"""sine of the tilt from which no silhouette from the side is seen: walls are a third as high as they are"""
 WIDER = 1.5
 """of the jet's median width, from which a row shows more than the jet"""
 FOOT = 0.2
@@ -36,11 +39,11 @@ def level_axes(camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
 class Rectified:
     """Rows of a silhouette in the vertical plane through the axis, from below."""
 
-    z: np.ndarray
+    z: Float[np.ndarray, " k"]
     """above the eye"""
-    width: np.ndarray
+    width: Float[np.ndarray, " k"]
     """of the widest run; 0 where there is none"""
-    middle: np.ndarray
+    middle: Float[np.ndarray, " k"]
     """of it, to the right of the eye"""
 
     @property
@@ -48,7 +51,12 @@ class Rectified:
         return float(np.percentile(self.width, 90))
 
     @classmethod
-    def of(cls, camera, mask, eye, right, forward, distance) -> Rectified | None:
+    def of(cls, camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], distance: float) -> Rectified | None:
+        """The rows of a mask at a distance along the ground; None where the camera looks down too steeply, or they are
+        too few."""
+        if abs(camera.camera_from_world.rotation[2, 2]) > STEEPEST_VIEW:
+            return None
+        eye, (right, forward) = camera.position, level_axes(camera)
         rays = camera.rays(camera.pixel_grid()[mask])
         ahead = rays[:, :2] @ forward
         rays, ahead = rays[ahead > 1e-3], ahead[ahead > 1e-3]

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from fluidlift.shape import depth_surface, surface
-from fluidlift.shape.filled_vessel import distance_ahead, pool_depths, vessel_of
+from fluidlift.shape.filled_vessel import distance_ahead, in_vessel, pool_depths, vessel_of
 from fluidlift.shape.heap import Heap, find_heap
 from fluidlift.shape.kinds.base import Observation
 from fluidlift.shape.looked_into import jet_rows
@@ -62,9 +62,10 @@ def _with_pool(front: FrontSurface, seen: Observation) -> FrontSurface:
     camera, mask = seen.camera, seen.mask
     ahead, ever = distance_ahead(camera, mask, front.depth + front.half_thickness), seen.ever
     ever = mask if ever is None else ever
-    heap = find_heap(camera, mask, ahead) or find_heap(camera, ever, ahead)  # it may begin to run down later
-    if heap is not None:
-        return _over_heap(front, seen, heap)
+    if not in_vessel(seen.rims, mask & ~jet_rows(mask)):
+        heap = find_heap(camera, mask, ahead) or find_heap(camera, ever, ahead)  # it may begin to run down later
+        if heap is not None:
+            return _over_heap(front, seen, heap)
     vessel = vessel_of(camera, mask, ever, ahead, seen.rims)
     if vessel is None:
         return front

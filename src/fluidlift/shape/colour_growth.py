@@ -1,4 +1,5 @@
-"""Colour where motion says too little: quiet water beside lively water, and clips where everything moves a little."""
+"""Colour where motion says too little: quiet water beside lively water, what lies still where it was poured, and clips
+where everything moves a little."""
 
 from __future__ import annotations
 

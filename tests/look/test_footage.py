@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fluidlift.look.footage import BROAD, FEWEST, RIM, SHARPER, SHOWN, FluidFootage
+from fluidlift.look.footage import BROAD, FEWEST, RIM, SHARPER, SHOWN, FluidFootage, grain_kept
 
 SIZE, FRAMES = (48, 64), 12
 WATER, BANK = np.array([60, 110, 150]), np.array([150, 90, 40])
@@ -223,3 +223,24 @@ def test_beyond_the_sides_of_the_picture_lies_its_mirror_image():
     np.testing.assert_array_equal(film.within(inside), inside)
     beside = np.array([[-3.0, 5.0], [height + 2.0, 5.0], [7.0, -0.5], [7.0, width + 9.0]])
     np.testing.assert_allclose(film.within(beside), [[3, 5], [height - 4, 5], [7, 0.5], [7, width - 11]])
+
+
+def test_less_is_kept_of_finer_grain_and_by_wider_splats():
+    fine, coarse = lively(sigma=0.4), lively(sigma=2.0)
+    kept = [[grain_kept(film, everywhere(), blur) for blur in (0.6, 0.9, 1.2)] for film in (fine, coarse)]
+    assert (np.diff(kept, axis=1) < 0).all() and (np.array(kept[1]) > np.array(kept[0])).all()
+    assert kept[0][2] < 0.5 and kept[1][0] > 0.9
+    still = np.full((FRAMES, *SIZE, 3), 90, np.uint8)
+    assert grain_kept(still, everywhere(), 1.0) == 1.0 and grain_kept(fine, ~everywhere(), 1.0) == 1.0
+
+
+def test_what_is_kept_is_what_the_film_then_shows():
+    """Against the picture of it: sharpened, and blurred as splats do."""
+    frames, blur = lively(sigma=0.7), 1.0
+    found = FluidFootage.of(frames, everywhere(), INTERVAL, blur=blur)
+    assert found is not None
+    own, shown = (
+        [np.std(g - cv2.GaussianBlur(g, (0, 0), 1.0)) for g in film.astype(np.float32).mean(axis=-1)]
+        for film in (frames, np.stack([cv2.GaussianBlur(f.astype(np.float32), (0, 0), blur) for f in found.frames]))
+    )
+    assert grain_kept(frames, everywhere(), blur) == pytest.approx(np.mean(shown) / np.mean(own), rel=0.05)

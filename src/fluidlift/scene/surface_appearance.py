@@ -90,10 +90,15 @@ LOOKED_UP = 1 / 6 + 0.3
 AS_AT_REST = "its surface looks as it did at rest"
 """what follows where there is no film to play"""
 
-FINE = 1.2
-"""px of the film between tracers of a skin that plays it, at most. Of 1.7, 1.2 and 0.85 (a level each) a fountain's
-finest band has 0.70, 0.83 and 0.88 of the clip's, sharpening included, and its current is off by 0.52, 0.43 and 0.39;
-frames are larger by a fifth from each to the next"""
+FINE, FINER = 1.7, 1.2
+"""px of the film between tracers of a skin that plays it, at most; and where its grain is too fine for that. Of 1.7,
+1.2 and 0.85 (a level each) a fountain's finest band has 0.70, 0.83 and 0.88 of the clip's, sharpening included, and its
+current is off by 0.52, 0.43 and 0.39; frames are larger by a fifth from each to the next"""
+
+GRAIN = 0.55
+"""of the amplitude of a film's finest band that splats `FINE` apart show, below which they lie closer. A fountain and a
+shallow river, which gain by it, have 0.45 and 0.28; calm rivers, a sea and corn that boils, which are as before, 0.50
+to 0.52; a torrent, a sunset and the demo, whose frames only get larger, or too crisp, 0.62 to 0.68"""
 
 SMALLEST = 0.02
 """standard deviation of a splat at least, cells: files hold its logarithm"""
@@ -128,8 +133,10 @@ class Dressed(NamedTuple):
     """m/s"""
 
 
-def _footage(film: Path, camera: PinholeCamera, means: np.ndarray, cell: float) -> FluidFootage | str:
-    """The film of an asset, taken apart; or what is wrong with it, in words.
+def _footage(
+    film: Path, camera: PinholeCamera, means: np.ndarray, cell: float
+) -> tuple[FluidFootage, float] | str:  # fmt: skip
+    """The film of an asset, taken apart, and how far apart (px of it) are what shows it; or what is wrong with it.
 
     Args:
         film: its file.
@@ -144,18 +151,21 @@ def _footage(film: Path, camera: PinholeCamera, means: np.ndarray, cell: float) 
         return f"is missing: {AS_AT_REST}; make the asset again"
     small = camera.resized(size_of_film(camera.size))
     coarse = PITCH * cell * small.focal[0] / np.maximum(small.project(means)[1], 1e-6)
-    apart = float(np.median(coarse * finer(level_for(coarse, FINE))))
-    blur = float(np.sqrt((WIDTH * apart) ** 2 + LOOKED_UP))
+    apart = [float(np.median(coarse * finer(level_for(coarse, wanted)))) for wanted in (FINE, FINER)]
+    usual, closer = (float(np.sqrt((WIDTH * a) ** 2 + LOOKED_UP)) for a in apart)
     written = film.stat()
-    return _taken_apart(film, camera.size, blur, (written.st_mtime_ns, written.st_size))
+    found = _taken_apart(film, camera.size, (usual, closer), (written.st_mtime_ns, written.st_size))
+    return found if isinstance(found, str) else (found[0], FINER if found[1] else FINE)
 
 
 @lru_cache(maxsize=1)
-def _taken_apart(film: Path, size: tuple[int, int], blur: float, written: tuple[int, int]) -> FluidFootage | str:
-    """As `_footage`, of a file as it was `written`. The last one is kept: it takes a second or two, and a live preview
-    begins anew with every edit."""
+def _taken_apart(
+    film: Path, size: tuple[int, int], blurs: tuple[float, float], written: tuple[int, int]
+) -> tuple[FluidFootage, bool] | str:
+    """As `_footage`, of a file as it was `written`, and whether the second, smaller of two blurs was taken. The last
+    one is kept: it takes a second or two, and a live preview begins anew with every edit."""
     from fluidlift.io.footage_file import read_footage
-    from fluidlift.look.footage import FEWEST, FluidFootage
+    from fluidlift.look.footage import FEWEST, FluidFootage, grain_kept
 
     try:
         frames, fluid, interval = read_footage(film, size)
@@ -163,8 +173,9 @@ def _taken_apart(film: Path, size: tuple[int, int], blur: float, written: tuple[
         return f"is damaged ({error.got}): {AS_AT_REST}; make the asset again"
     if len(frames) < FEWEST:
         return f"has {len(frames)} frames and needs {FEWEST}: {AS_AT_REST}; make the asset from a longer clip"
-    found = FluidFootage.of(frames, fluid, interval, blur=blur)
-    return f"shows none: {AS_AT_REST}; make the asset again" if found is None else found
+    closer = grain_kept(frames, fluid, blurs[0]) < GRAIN
+    found = FluidFootage.of(frames, fluid, interval, blur=blurs[closer])
+    return f"shows none: {AS_AT_REST}; make the asset again" if found is None else (found, closer)
 
 
 def levelled(surface: SurfaceMap, level: float, within: float) -> SurfaceMap:
@@ -203,7 +214,7 @@ class SurfaceAppearance:
         self._pace = 1.0
         """frames of the film per frame of the scene"""
         self._level: float | None = None
-        self._plays = False
+        self._plays, self._fine = False, FINE
         self._wall: np.ndarray | None = None
         """[h,w], camera depth (m) of a vessel's wall that hides what it holds; None: nothing is hidden so"""
         self._tracers = 0
@@ -314,10 +325,11 @@ class SurfaceAppearance:
         if isinstance(found, str):
             self._missing = (Notice("film-not-played", f"the film of the fluid {found}"),)
             return None
-        self._camera = scene.camera.resized((found.mean.shape[1], found.mean.shape[0]))
+        footage, self._fine = found
+        self._camera = scene.camera.resized((footage.mean.shape[1], footage.mean.shape[0]))
         if scene.terrain.opaque:
             self._wall = terrain_depth(scene.terrain, self._camera)
-        return found
+        return footage
 
     def _level_at(self, places: np.ndarray) -> np.ndarray:
         """How fine the skin is at places of the map: as the film's pixels are there, 0 beside its picture.
@@ -339,7 +351,7 @@ class SurfaceAppearance:
         uphill = PITCH * self._cell * np.concatenate([slopes / np.maximum(steep, 1e-9), steep], axis=1)
         beside = camera.project(self._axes.world_points(points + uphill))[0]
         apart = np.maximum(apart, lengths(beside - uv))
-        return np.where(inside, level_for(apart, FINE), 0)
+        return np.where(inside, level_for(apart, self._fine), 0)
 
     def _seen_texture(self, surface: SurfaceMap, footage: FluidFootage | None) -> SeenTexture:
         from fluidlift.look.inflow import ENDS
@@ -504,7 +516,9 @@ class SurfaceAppearance:
         drop = DROP * self._cell
         if self._outline is not None:  # drops before what plays its film are as sharp as that
             away = self._camera.project(particles.positions)[1]
-            drop = np.minimum(drop, np.maximum(WIDTH * FINE / self._camera.focal[0] * away, SMALLEST * self._cell))
+            drop = np.minimum(
+                drop, np.maximum(WIDTH * self._fine / self._camera.focal[0] * away, SMALLEST * self._cell)
+            )
         room = np.minimum(room, drop * loose + LARGEST * self._cell * (1 - loose))
         if self._outline is not None:
             filmed = self._outline.room(shown.means)

@@ -63,7 +63,10 @@ def test_none_where_nothing_runs_down_nothing_falls_in_or_nothing_is_wide():
 
 def test_what_it_covers_lies_a_film_below_its_outside_and_goes_down_to_the_ground():
     heap, film = made(0.0), 0.02
-    inside = lambda x, z: heap.core(np.array([[x, AWAY, z]]), film)[0]  # noqa: E731
+
+    def inside(x: float, z: float) -> float:
+        return float(heap.core(np.array([[x, AWAY, z]]), film)[0])
+
     assert inside(0.2 - film, 0.0) == pytest.approx(0.0, abs=0.1 * film)
     assert inside(0.2, 0.0) == pytest.approx(film, rel=0.1) and inside(0.1, 0.0) < -film
     assert inside(0.1, -5.0) < 0 < inside(0.2, -5.0)

@@ -84,3 +84,16 @@ def test_a_splat_that_keeps_its_colour_grows_as_one_that_shares_it():
     inner = (np.abs(g.means[:, :2] - 5.5) < 4).all(1)
     np.testing.assert_allclose(drawn.scales[inner], still.scales[inner], rtol=1e-6)
     np.testing.assert_array_equal(drawn.sh[1::2], g.sh[1::2])
+
+
+def test_splats_that_nobody_sees_stay_as_they_are_and_the_others_look_as_if_all_were_looked_at():
+    g = chequered()
+    g = Gaussians(g.means * 2, g.quats, g.scales, g.opacities, g.sh)
+    drawn = np.tile(np.eye(3), (len(g), 1, 1))
+    drawn[::3] = shear(3.5, len(drawn[::3]))
+    seen = np.arange(len(g)) % 2 == 0
+    every, some = mixed(g, drawn, widest=2.0), mixed(g, drawn, widest=2.0, seen=seen)
+    for name in ("sh", "scales"):
+        np.testing.assert_array_equal(getattr(some, name)[seen], getattr(every, name)[seen])
+        np.testing.assert_array_equal(getattr(some, name)[~seen], getattr(g, name)[~seen])
+        assert not np.array_equal(getattr(every, name)[~seen], getattr(g, name)[~seen])

@@ -151,6 +151,22 @@ def test_what_pours_or_stands_is_as_wide_as_each_frame_shows_it(channel, tmp_pat
     assert min(edited) > max(seen), "where somebody changes how it flows it is where it flows"
 
 
+def test_after_its_film_an_outline_that_grew_comes_back_where_nothing_takes_what_is_poured(channel, tmp_path):
+    count = 12
+    wet = np.zeros((count, 48, 64), bool)
+    for t in range(count):
+        wet[t, :, 8 : 33 + 2 * t] = True
+    grain = np.random.default_rng(0).integers(0, 255, (count, 48, 64, 3)).astype(np.uint8)
+    path = write_footage(tmp_path / "film.mp4", grain, wet, 0.04)
+    scene = channel(3 * count, kind="pour", film=path)
+    scene = replace(scene, dry=np.zeros(scene.terrain.grid.shape, bool))
+    kept, goes_on = (widths_shown(replace(scene, dry_for=known), 3 * count) for known in (np.inf, count * 0.04))
+    assert kept[1:count] == goes_on[1:count], "while it plays"
+    last = 33 + 2 * (count - 1) - 8
+    assert min(goes_on[count:]) >= last - 4, "its last one holds"
+    assert min(kept[count:]) < last - 8, "it is as wide as what it shows"
+
+
 def test_what_the_wall_of_a_vessel_hides_looks_as_what_is_seen_of_it(channel, tmp_path):
     """The film shows dark fluid on the left and a white wall on the right, which stands before the rest of it."""
     count = 8

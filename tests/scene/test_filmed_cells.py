@@ -121,12 +121,15 @@ def test_an_outline_that_grows_is_known_to_the_end_of_its_clip_and_one_that_stay
         frame[25 - t : 25, 10:20] = Label.FLUID
     grows, stays = FluidMasks(labels), FluidMasks(labels[-1:].repeat(4, axis=0))
     sways = FluidMasks(np.stack([np.roll(labels[10], t, axis=1) for t in range(10)]))
-    for kind, masks, dry_for in (("pour", grows, 0.8), ("pour", stays, np.inf), ("stream", grows, np.inf),
-                                 ("pour", sways, np.inf)):  # fmt: skip
-        shares, known = filmed_shares(kind_of(kind), masks, 0.8)
-        assert known == dry_for
+    for kind, masks, held, dry_for in (
+        ("pour", grows, True, 0.8), ("pour", stays, True, np.inf), ("stream", grows, False, np.inf),
+        ("pour", sways, True, np.inf), ("pour", grows, False, np.inf), ("plume", grows, False, 0.8),
+    ):  # fmt: skip
+        shares, known = filmed_shares(kind_of(kind), masks, 0.8, held=held)
+        assert known == dry_for, "what is poured goes on to rise where a vessel takes it, or it would flood a table"
         np.testing.assert_array_equal(shares, masks.shares())
-    assert filmed_shares(kind_of("dam"), grows, 0.8)[0] is None, "it would lose fluid that nothing brings back"
+    shares, _ = filmed_shares(kind_of("dam"), grows, 0.8, held=False)
+    assert shares is None, "it would lose fluid that nothing brings back"
 
 
 def test_of_an_outline_that_grows_cells_stay_dry_as_long_as_its_clip(channel):

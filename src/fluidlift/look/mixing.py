@@ -8,7 +8,7 @@ grain and as dotted lines. Their mean is what such a mixture looks like.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from fluidlift.errors import require
 from fluidlift.numerics.nearest import nearest_of_crowd
@@ -46,7 +46,13 @@ def mixed_share(deformation: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " 
     return np.clip((np.nan_to_num(rms, nan=low) - low) / (high - low), 0.0, 1.0)
 
 
-def mixed(shown: Gaussians, deformation: Float[np.ndarray, "n 3 3"], *, widest: float) -> Gaussians:
+def mixed(
+    shown: Gaussians,
+    deformation: Float[np.ndarray, "n 3 3"],
+    *,
+    widest: float,
+    seen: Bool[np.ndarray, " n"] | None = None,
+) -> Gaussians:
     """Splats that were drawn out show the mean of the colours around them, and close up with their neighbours.
 
     Weights fall to zero at the last of the neighbours, so that colours change smoothly while neighbours come and go.
@@ -57,6 +63,7 @@ def mixed(shown: Gaussians, deformation: Float[np.ndarray, "n 3 3"], *, widest: 
         shown: the splats now, m.
         deformation: F of each of them.
         widest: standard deviation to which they may grow, m: that of a splat of the inside.
+        seen: those that anybody sees: the others stay as they are. None: all.
 
     Raises:
         ValueError: another number of deformations than of splats, or `widest` not positive.
@@ -65,7 +72,8 @@ def mixed(shown: Gaussians, deformation: Float[np.ndarray, "n 3 3"], *, widest: 
     require(widest > 0, f"widest {widest}", "positive metres")
     sound = every(np.isfinite(shown.means))
     share, size = mixed_share(deformation), most(shown.scales)
-    at = np.flatnonzero(sound & ((share > 0) | (size < 0.5 * widest)))
+    at = sound & ((share > 0) | (size < 0.5 * widest))
+    at = np.flatnonzero(at if seen is None else at & seen)
     if len(at) == 0 or sound.sum() <= NEIGHBOURS:
         return shown
     around = np.flatnonzero(sound)

@@ -188,7 +188,7 @@ def _calibrated(runner: Runner, lift: Lift, asset: FluidAsset, config: JobConfig
     target = mean_target(asset, lift.motion, lift.elsewhere)
     masks, s = FluidMasks(lift.labels.labels, lift.geometry.hidden), config.simulate
     left = (len(masks) - lift.geometry.rest_frame) * asset.interval
-    shares, dry_for = filmed_shares(kind_of(asset.kind), masks, left)
+    shares, dry_for = filmed_shares(kind_of(asset.kind), masks, left, held=lift.geometry.setting.pool_level is not None)
     return runner.run(
         "calibrate", calibrate, scene, target, shares, dry_for, wanted=s.follow > 0, beside={"device": s.device}
     )

@@ -166,6 +166,11 @@ class Scene:
         moved = self.inflow != InflowSchedule() or self.extended > 0
         return bool(self.obstacles or self.emitters or self.changes or self.reshaped or moved)
 
+    @property
+    def outline_goes_on(self) -> bool:
+        """Whether an outline that grew in the clip goes on to after it: not where what is dry is so for good."""
+        return self.dry is None or math.isfinite(self.dry_for)
+
     @cached_property
     def parts(self) -> dict[str, str]:
         """A hash of each part that decides how the simulation goes: two scenes with the same ones go the same way."""

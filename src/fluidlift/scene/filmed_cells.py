@@ -31,24 +31,27 @@ STEP = 0.5
 
 
 def filmed_shares(
-    kind: FluidKind, masks: FluidMasks, left: float
+    kind: FluidKind, masks: FluidMasks, left: float, *, held: bool
 ) -> tuple[Float[np.ndarray, "h w"] | None, float]:  # fmt: skip
     """Share of a clip's frames in which each pixel is fluid, and for how long (s) what is dry in all of them stays so.
 
     The outline of what lies on ground, falls steadily or sways about stays as it was filmed. One that grows, as that
-    of a vessel which fills, goes on to do so after its clip. Nothing (None) is said of what collapses: no inlet would
-    make up for fluid that was taken out.
+    of a vessel which fills, goes on to do so after its clip, unless it is of a pour in whose scene no vessel was found
+    to take it: there it would run over the table. Nothing (None) is said of what collapses: no inlet would make up for
+    fluid that was taken out.
 
     Args:
         kind: of the fluid.
         masks: of the clip.
         left: s of the clip from the body at rest on.
+        held: whether there is a vessel that holds it.
     """
     if kind.lies_on_ground:
         return masks.shares(), math.inf
     if kind.starts_at_rest and share_that_stays(masks) <= STAYS:
         return None, math.inf
-    return masks.shares(), left if outline_grows(masks) else math.inf
+    goes_on = (held or not kind.fills_vessel) and outline_grows(masks)
+    return masks.shares(), left if goes_on else math.inf
 
 
 def dry_cells(

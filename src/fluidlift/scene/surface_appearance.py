@@ -133,6 +133,23 @@ class Dressed(NamedTuple):
     """m/s"""
 
 
+class UnderSkin(NamedTuple):
+    """How particles lie to the skin of a frame, each [n]."""
+
+    places: np.ndarray
+    """[n,3], on the axes of the surface, m"""
+    above: np.ndarray
+    """cells over the skin; negative: below it"""
+    loose: np.ndarray
+    """how far they are spray, 0 to 1"""
+    covered: np.ndarray
+    """share of which the skin hides them: of 1 nobody sees them"""
+    hidden: np.ndarray
+    """whether the wall of a vessel does"""
+    filmed: np.ndarray | None
+    """m to the outline of the film; None: there is none"""
+
+
 def _footage(
     film: Path, camera: PinholeCamera, means: np.ndarray, cell: float
 ) -> tuple[FluidFootage, float] | str:  # fmt: skip
@@ -276,7 +293,7 @@ class SurfaceAppearance:
         radius = AT_HOME if footage is not None and not scene.edited else PATCH
         # a jet is one thing: pieces of it from different instants do not fit together where it sways
         pours = (kind.rises_from_pool or not kind.lies_on_ground) and not scene.edited
-        grows = pours and footage is not None and footage.grows
+        grows = pours and footage is not None and footage.grows and scene.outline_goes_on
         self._patches = TexturePatches(
             texture, max(radius * across, FEWEST_CELLS * self._cell), footage=footage,
             edited=scene.edited and not stands, start=scene.film_start, together=stands or pours,
@@ -471,14 +488,17 @@ class SurfaceAppearance:
             shown = _round(scene.rest, particles)
             return Dressed(*self._smoke.dressed(shown, particles, number, self._own_colors(particles.source)))
         shown = carry(scene.rest, particles, max_stretch=MAX_STRETCH, max_size=LARGEST * self._cell)
-        if number:  # at rest nothing is drawn out
-            shown = mixed(shown, particles.deformation, widest=MIXED * self._cell)
-        shown = self._shaded(shown, particles.source)
         # without a film the body at rest is what was seen of its surface
         at_rest = not number and not self._plays
-        if at_rest or self._patches is None or self._surface is None or not len(particles):
+        surface = None if at_rest or self._patches is None or not len(particles) else self._surface
+        under = None if surface is None else self._under_skin(particles, surface)
+        if number:  # at rest nothing is drawn out
+            seen = None if under is None else (under.covered < 1) | self._own_colors(particles.source)
+            shown = mixed(shown, particles.deformation, widest=MIXED * self._cell, seen=seen)
+        shown = self._shaded(shown, particles.source)
+        if under is None:
             return Dressed(shown, 2 * particles.ids, particles.velocities)
-        return self._with_skin(shown, particles, self._surface, self._patches, inside)
+        return self._with_skin(shown, particles, under, inside)
 
     def _shaded(self, shown: Gaussians, source: np.ndarray) -> Gaussians:
         """The splats with the shade of the places where they are now; those with a colour of their own keep it."""
@@ -492,19 +512,11 @@ class SurfaceAppearance:
         moved = scene.shading.moved(shown, np.where(own[:, None], shown.means, painted))
         return moved if not own.any() else replace(moved, sh=np.where(own[:, None, None], shown.sh, moved.sh))
 
-    def _with_skin(
-        self,
-        shown: Gaussians,
-        particles: Particles,
-        surface: SurfaceMap,
-        patches: TexturePatches,
-        inside: Inside | None,
-    ) -> Dressed:
+    def _under_skin(self, particles: Particles, surface: SurfaceMap) -> UnderSkin:
+        """Where particles lie below the skin of a frame."""
         from fluidlift.look.smoothstep import smoothstep
-        from fluidlift.look.surface_axes import PictureAxes
-        from fluidlift.look.surface_skin import WIDTH, dyed
 
-        skin, axes, places = self._skin, self._axes, self._axes.points(particles.positions)
+        places = self._axes.points(particles.positions)
         xy = places[:, :2]
         above = (places[:, 2] - surface.at(surface.height, xy)) / self._cell
         below, spray = COVERED
@@ -512,6 +524,19 @@ class SurfaceAppearance:
         covered = smoothstep(above, *below) * (1 - loose) * (presence > 0.5)
         hidden = self._hidden(particles.positions)
         loose = np.where((presence > LONELY) | hidden, loose * ~hidden, 1.0)
+        filmed = None if self._outline is None else self._outline.room(particles.positions)
+        if filmed is not None:
+            covered = np.where((filmed > 0) | hidden, covered, 1.0)
+        return UnderSkin(places, above, loose, covered * ~hidden, hidden, filmed)
+
+    def _with_skin(self, shown: Gaussians, particles: Particles, under: UnderSkin, inside: Inside | None) -> Dressed:
+        """The splats of particles, and over them the skin of the frame to which `advance` has come."""
+        from fluidlift.look.surface_axes import PictureAxes
+        from fluidlift.look.surface_skin import WIDTH, dyed
+
+        skin, axes, surface, patches = self._skin, self._axes, self._surface, self._patches
+        assert surface is not None and patches is not None
+        places, above, loose, covered, hidden, filmed = under
         room = REACH * np.maximum(self._clearance(shown.means) + CLEAR * self._cell, CLEAR * self._cell)
         drop = DROP * self._cell
         if self._outline is not None:  # drops before what plays its film are as sharp as that
@@ -520,11 +545,8 @@ class SurfaceAppearance:
                 drop, np.maximum(WIDTH * self._fine / self._camera.focal[0] * away, SMALLEST * self._cell)
             )
         room = np.minimum(room, drop * loose + LARGEST * self._cell * (1 - loose))
-        if self._outline is not None:
-            filmed = self._outline.room(shown.means)
-            covered = np.where((filmed > 0) | hidden, covered, 1.0)
+        if filmed is not None:
             room = np.where(hidden, room, np.minimum(room, np.maximum(filmed, SMALLEST * self._cell)))
-        covered = covered * ~hidden
         scales = np.minimum(shown.scales, room[:, None]).astype(np.float32)
         opacities = np.minimum(shown.opacities, np.maximum(shown.opacities * (1 - covered), FAINT)).astype(np.float32)
         sh, own = shown.sh.copy(), self._own_colors(particles.source)
@@ -548,7 +570,7 @@ class SurfaceAppearance:
         tracers = axes.world_splats(skin.splats(surface, color).select(there))
         if self._sways and covers.min(initial=1.0) < 1.0:
             tracers = replace(tracers, opacities=tracers.opacities * covers[there].astype(np.float32))
-            opacities *= surface.at(surface.mean(covers, skin.places, 1.0), xy).astype(np.float32)
+            opacities *= surface.at(surface.mean(covers, skin.places, 1.0), places[:, :2]).astype(np.float32)
         speeds = axes.world_velocities(points[there], surface.at(surface.velocity, skin.places[there]))
         return Dressed(
             concatenate([replace(shown, scales=scales, opacities=opacities, sh=sh), tracers]),

@@ -3,11 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fluidlift.evaluate.images import mask_iou
+from fluidlift.evaluate.images import mask_iou, resample_nearest
 from fluidlift.motion.optical_flow import DenseInverseSearch, flow_of_pair
 from fluidlift.shape.evidence import gather_evidence
 from fluidlift.shape.segment import clues_of, segment
-from fluidlift.shape.vessel_contents import filled_vessels, with_contents
+from fluidlift.shape.vessel_contents import AROUND_IT, filled_vessels, with_contents
 from fluidlift.synthetic.vessels import filmed_vessel
 from fluidlift.types.clip import Label, VideoClip
 
@@ -105,3 +105,21 @@ def test_where_the_rest_is_a_guess_or_a_vessel_fills_what_is_apart_from_it_is_le
     labels, _ = next(with_contents(found, (vessel,), known.evidence, nothing, nothing, alone=alone))
     assert (labels[-20:, :20] == Label.FLUID).all() != (alone or fills)
     assert (labels == Label.FLUID).sum() > 400
+
+
+def test_what_is_poured_from_is_left_out_and_its_jet_stays(poured):
+    clip, flow, made = poured
+    known = clues_of(clip, flow)
+    shape = known.evidence.noise.shape
+    nothing, jug = np.zeros(shape, bool), np.zeros(shape, bool)
+    fluid = resample_nearest(made.fluid, shape[::-1])
+    rows = np.flatnonzero(fluid[0].any(axis=1))[0]
+    column = int(np.flatnonzero(fluid[0][rows]).mean())
+    jug[: rows + 3, column - 45 : column + 46] = True
+    found = iter([(np.where(f | jug, np.uint8(Label.FLUID), np.uint8(0)), np.ones(shape, np.float32)) for f in fluid])
+    vessel = known.vessels
+    for (labels, _), truth in zip(with_contents(found, vessel, known.evidence, nothing, nothing, alone=False), fluid):
+        left = labels == Label.FLUID
+        beyond_rim = jug & (np.hypot(*vessel[0].disc.coordinates(shape)) > AROUND_IT[0])
+        assert left[beyond_rim].mean() < 0.01, "a jet is no wider above than it is below"
+        assert left[truth & ~jug].mean() > 0.95

@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 
 from fluidlift.shape.evidence import Evidence
 from fluidlift.shape.min_cut import disc as patch
+from fluidlift.shape.min_cut import spread
 from fluidlift.shape.view import find_rims
 from fluidlift.shape.view.roundness import Ellipse
 from fluidlift.types.clip import Label
@@ -84,6 +85,9 @@ GAP = 0.1
 AFLOAT = 0.8
 """of something that moves as a whole, within a rim, from which it is taken to drift on the liquid: what swings in
 before it reaches beyond the rim"""
+WIDER = 3.0
+"""times as wide as where it is seen before a vessel's wall a jet is above it, at most: falling, it draws in as the root
+of its speed, here from a ninth of that. What is wider is what it is poured from"""
 MARGIN = 1.04
 """radii to which what is seen within a rim may be marked over it"""
 
@@ -245,7 +249,8 @@ def with_contents(
     """Labels u8 and confidence f32 [h,w] of every frame, where vessels show their liquid up to its level.
 
     What was taken for fluid on the wall above the level is only if it looks like the liquid and falls into it. While a
-    vessel fills, the fluid is what it holds and what falls in: other pieces are of what pours, such as a pot of glass.
+    vessel fills, the fluid is what it holds and what falls in: other pieces, and what is too wide for a jet, are of
+    what pours, such as a pot of glass.
 
     Args:
         found: labels and confidence without that.
@@ -260,23 +265,36 @@ def with_contents(
     withins = [np.hypot(x, y) < MARGIN for x, y in places]
     bars = [_from_outside(barred, within) for within in withins]
     mouths = [(np.hypot(x, y) < AROUND_IT[0]) & (y < 0.0) for x, y in places]
-    others = ~np.any(withins, axis=0) & ~held
+    others, jet = ~np.any(withins, axis=0) & ~held, 0.0
     for t, (before, doubted) in enumerate(found):
         labels, sure = before.copy(), doubted.copy()
         picture = evidence.source[t].astype(np.float32)
-        near = np.zeros(shape, bool)
+        near, in_air = np.zeros(shape, bool), np.zeros(shape, bool)
         for vessel, within, bar, mouth in zip(vessels, withins, bars, mouths, strict=True):
             wet = vessel.surface(t, shape) & ~bar
             falling = _falling_in(picture, wet, within & ~wet, before == Label.FLUID)
             own = within & ~held
             labels[own] = np.where(wet | falling, np.uint8(Label.FLUID), np.uint8(Label.BACKGROUND))[own]
             sure[own] = np.float32(vessel.worth)
+            in_air |= falling
             near |= _within_reach(wet | falling, vessel) if vessel.fills else mouth
         if alone or any(vessel.fills for vessel in vessels):
             outside = (labels != Label.BACKGROUND) & others
+            fluid = labels == Label.FLUID
+            jet = _half_width(in_air) if in_air.any() else jet
+            if jet > 0.0:
+                wide = cv2.morphologyEx(fluid.astype(np.uint8), cv2.MORPH_OPEN, patch(WIDER * jet)) > 0
+                labels[outside & spread(wide, jet)] = Label.BACKGROUND
+                outside &= labels != Label.BACKGROUND
             parts = cv2.connectedComponents(outside.astype(np.uint8), connectivity=8)[1]
             labels[outside & ~np.isin(parts, np.unique(parts[near & outside]))] = Label.BACKGROUND
         yield labels, sure
+
+
+def _half_width(jet: Bool[np.ndarray, "h w"]) -> float:
+    """Px, of a jet in most of its rows."""
+    rows = jet.sum(axis=1)
+    return 0.5 * float(np.median(rows[rows > 0]))
 
 
 def _within_reach(liquid: Bool[np.ndarray, "h w"], vessel: Vessel) -> Bool[np.ndarray, "h w"]:

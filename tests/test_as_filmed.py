@@ -288,6 +288,16 @@ def test_a_vessel_fills_though_the_jet_above_it_sways(seed):
     assert growth(still | jet) == 0.0
 
 
+@pytest.mark.parametrize("grows", [True, False])
+def test_a_vessel_fills_though_it_begins_late_and_one_that_settles_again_does_not(grows):
+    frames, late = 36, 20
+    rows = 22 - np.concatenate([np.linspace(0, -0.5, late), np.linspace(0, 7, frames - late)])  # a jet gets thinner
+    if not grows:  # up and down again, higher in the second half on the whole
+        rows = 20 - 3 * np.sin(np.pi * np.clip((np.arange(frames) - 12) / 24, 0, 1))
+    masks = np.concatenate([filling(1, row, row) for row in rows])
+    assert (growth(masks) > 0) == grows
+
+
 def test_a_level_that_goes_up_and_down_is_held_to_its_mean_after_the_clip():
     clip, rows = film(), (20 + 3 * np.sin(np.linspace(0, 2 * np.pi, T))).round().astype(int)
     waves = np.stack([filling(1, row, row)[0] for row in rows])

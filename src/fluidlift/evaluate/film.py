@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from fluidlift.motion.optical_flow import DenseInverseSearch, each_pair
+from fluidlift.types.fluid_masks import outline_grows
 
 BANDS = 4
 """of the Laplacian pyramid, the finest first: details of 1, 2, 4 and 8 px"""
@@ -35,6 +36,9 @@ CELL = 1.0 / 32.0
 
 SURE_GROWTH = 2.0
 """standard errors by which a fluid's area must grow over a clip"""
+STILL = 0.2
+"""of what a fluid has grown from the first quarter of a clip to the last, that it grows within the second half at
+least: at one rate it is a third; of a wave that comes back, 0"""
 FEWEST_ALONE = 3.0
 """frames that count as independent at least: a straight line must explain 0.8 of what varies then; of a whole wave,
 which comes back, it explains 6 / pi^2 = 0.61"""
@@ -78,7 +82,8 @@ def growth(masks: Bool[np.ndarray, "t h w"]) -> float:
     """Share of its mean area by which a fluid grows from frame to frame (negative: shrinks), as in a vessel that fills.
 
     Least squares over the frames; 0 where it is less than `SURE_GROWTH` standard errors, as with waves on a beach. What
-    is left over of neighboring frames is alike: of n with a correlation r, n (1 - r) / (1 + r) are independent.
+    is left over of neighboring frames is alike: of n with a correlation r, n (1 - r) / (1 + r) are independent. A
+    vessel need not fill at one rate: an outline that grows counts as well where it still does at the end.
     """
     areas = masks.reshape(len(masks), -1).sum(axis=1).astype(float)
     if len(masks) < 3 or areas.std() <= 1e-9 * areas.mean():
@@ -90,7 +95,15 @@ def growth(masks: Bool[np.ndarray, "t h w"]) -> float:
     alike = min(max(float(rest[1:] @ rest[:-1]) / power, 0.0), 1.0) if power > 0 else 0.0
     alone = max(len(masks) * (1.0 - alike) / (1.0 + alike), FEWEST_ALONE)
     surely = slope * slope * float(time @ time) * (alone - 2.0) > SURE_GROWTH**2 * power
-    return slope / float(areas.mean()) if surely else 0.0
+    return slope / float(areas.mean()) if surely or _still_grows(masks, areas) else 0.0
+
+
+def _still_grows(masks: Bool[np.ndarray, "t h w"], areas: Float[np.ndarray, " t"]) -> bool:
+    """Whether an outline grows, and does so in the last quarter of a clip: what comes back has grown before."""
+    quarter = max(len(areas) // 4, 1)
+    first, before, last = (float(part.mean()) for part in (areas[:quarter], areas[-2 * quarter : -quarter],
+                                                           areas[-quarter:]))  # fmt: skip
+    return last - before > STILL * (last - first) > 0.0 and outline_grows(masks)
 
 
 def _grown(mask: np.ndarray, radius: int) -> np.ndarray:

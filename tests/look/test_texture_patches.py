@@ -13,7 +13,7 @@ from fluidlift.look.picture_texture import PictureTexture
 from fluidlift.look.seen_texture import SeenTexture
 from fluidlift.look.surface_axes import PictureAxes
 from fluidlift.look.surface_map import SurfaceMap
-from fluidlift.look.texture_patches import FASTEST, LIMIT, Patches, TexturePatches
+from fluidlift.look.texture_patches import FASTEST, LIMIT, Patches, TexturePatches, instants_together
 from fluidlift.types import Gaussians, PinholeCamera
 
 CELL, SIZE = 0.1, 4.0
@@ -479,3 +479,17 @@ def test_patches_of_a_sea_show_one_instant_and_begin_again_together():
         ended += bool(frame) and bool(staying[0] < before - 1.0)
         before = staying[0]
     assert ended == 1 and before == 10.0, "after nine frames from the first one on"
+
+
+@pytest.mark.parametrize(("again", "interval"), [(0.0, STEP), (0.5 * len(FILM), STEP), (0.0, 1.6 * STEP)])
+def test_the_instant_that_all_of_them_show_is_known_beforehand(again, interval):
+    ground, rng = upright(uniform(0.0)), np.random.default_rng(0)
+    jet = TexturePatches(PictureTexture(AXES, ground, FILM), 0.6, footage=FILM, start=40.0, together=True, again=again)
+    shown = []
+    for k in range(3 * len(FILM)):
+        jet.advance(ground, interval if k else 0.0, rng)
+        shown.append(jet.leading)
+    pace = interval / FILM.interval
+    expected = instants_together(len(FILM), start=40.0, again=again, pace=pace, count=len(shown))
+    apart = np.abs(np.array(shown) - expected)
+    assert np.median(apart) < 0.01 and (apart > 2.0 * pace).mean() < 0.05

@@ -16,6 +16,7 @@ from fluidlift.io.array_archive import read_arrays
 from fluidlift.io.asset_folder import FILES
 from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import atomic_write
+from fluidlift.io.footage_file import MOST_FRAMES
 from fluidlift.types import FaceVelocity, Filmed, FilmedMotion
 
 
@@ -28,6 +29,8 @@ def write_filmed(folder: Path, filmed: Filmed) -> None:
         arrays |= {name: np.packbits(cells) for name, cells in known.items() if cells is not None}
         if np.isfinite(filmed.dry_for):
             arrays["dry_for"] = np.float64(filmed.dry_for)
+        if filmed.inlet is not None:
+            arrays["inlet"] = filmed.inlet.astype(np.float32)
     _write(asset_file(folder, FILES["force"]), arrays)
     motion: dict[str, Any] = {}
     if filmed.motion is not None:
@@ -61,7 +64,8 @@ def read_filmed(folder: Path, *, motion: bool = False) -> Filmed:
         with _named(path, "a force on the faces of a grid"):
             force = FaceVelocity(*(np.asarray(found[n], np.float32) for n in "uvw"))
             dry, wet = (_unpacked(found[n], n, force.shape) if n in found else None for n in ("dry", "wet"))
-            kept = Filmed(force, dry, float(found.get("dry_for", np.inf)), wet)
+            inlet = _offsets(found["inlet"]) if "inlet" in found else None
+            kept = Filmed(force, dry, float(found.get("dry_for", np.inf)), wet, inlet=inlet)
     if not motion or not moving.is_file():
         return kept
     found = read_arrays(moving, ("u", "v", "w", "interval", "start"))
@@ -77,6 +81,13 @@ def _named(path: Path, wanted: str) -> Iterator[None]:
         yield
     except (IndexError, TypeError, ValueError) as error:
         raise InputRejected(f"'{path.name}': {error}", wanted, "make the asset again") from None
+
+
+def _offsets(inlet: np.ndarray) -> np.ndarray:
+    """float64 [T,3], m, of an inlet in each frame of a film."""
+    right = inlet.dtype == np.float32 and inlet.ndim == 2 and inlet.shape[1] == 3 and 0 < len(inlet) <= MOST_FRAMES
+    require(right and bool(np.isfinite(inlet).all()), f"an inlet {inlet.dtype} {inlet.shape}", "metres, three a frame")
+    return inlet.astype(np.float64)
 
 
 def _unpacked(bits: np.ndarray, name: str, shape: tuple[int, int, int]) -> np.ndarray:

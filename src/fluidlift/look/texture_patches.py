@@ -209,7 +209,7 @@ class TexturePatches:
         strains = s.strains + interval * rate
         fade = np.clip(LIMIT / 3 / np.maximum(rate * interval, 1e-9), *FADE)
         if self._footage is not None:  # those that go must be gone by the film's last frame
-            fade = np.clip(_fade_of(self._footage) / np.maximum(instants - s.instants, 1e-9), 1.0, fade)
+            fade = np.clip(_fade_of(len(self._footage)) / np.maximum(instants - s.instants, 1e-9), 1.0, fade)
         going = (strains > LIMIT) | (instants >= s.ends)
         presences = np.clip(s.presences + np.where(going, -1, 1) / fade, 0.0, 1.0)
         new = Patches(centers, s.sources, turns, strains, presences, instants, s.ends)
@@ -277,7 +277,7 @@ class TexturePatches:
         if not at_home.all():
             flow = _gradients(surface, SMOOTH * self._radius)[0] if flow is None else flow
             turns = np.where(at_home, 0.0, _wrapped(self._heading(surface, flow, centers, sources)))
-        last, fade = len(self._footage) - 1.0, _fade_of(self._footage)
+        last, fade = len(self._footage) - 1.0, _fade_of(len(self._footage))
         if self._together:
             lasting = self.state.instants[~self.state.going]
             now = float(np.median(lasting)) if len(lasting) else min(self._start, last) if first else self._again
@@ -418,9 +418,32 @@ def _spread_of(point: np.ndarray, instants: np.ndarray, home: np.ndarray, weight
     return np.sqrt(alike + np.bincount(point[~home], weight[~home] ** 2, minlength=n))
 
 
-def _fade_of(footage: FluidFootage) -> float:
-    """Frames of the footage over which a patch comes or goes."""
-    return min(FADE[1], FILM_FADE * len(footage))
+def _fade_of(frames: int) -> float:
+    """Frames of a film of so many over which a patch comes or goes."""
+    return min(FADE[1], FILM_FADE * frames)
+
+
+def instants_together(frames: int, *, start: float, again: float, pace: float, count: int) -> Float[np.ndarray, " n"]:
+    """Instant of a film that is most present in each frame of a scene where all patches show the same one.
+
+    Args:
+        frames: of the film.
+        start: of it, that the first frame of the scene shows.
+        again: at which it begins anew.
+        pace: frames of the film per frame of the scene.
+        count: frames of the scene.
+    """
+    last, fade = frames - 1.0, _fade_of(frames)
+    found, now, following = np.empty(count), min(start, last), None
+    for frame in range(count):
+        found[frame] = now
+        now = min(now + pace, last)
+        following = None if following is None else following + pace
+        if following is None and now >= last - fade:
+            following = again
+        if following is not None and following - again >= 0.5 * fade:  # it has come in by as much as the other is gone
+            now, following = following, None
+    return found
 
 
 def _turned(vectors: np.ndarray, angles: np.ndarray) -> np.ndarray:

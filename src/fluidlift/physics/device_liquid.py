@@ -50,5 +50,6 @@ def left_to_the_host(surroundings: Surroundings, forces: Sequence[BodyForce], bo
         "a force of its own kind": not all(isinstance(f, (SteadyForce, Nudging, Guiding)) for f in forces),
         "a prescribed outflow": surroundings.settings.prescribe_outflow,
         "drops that fly": surroundings.settings.airy_above is not None,
+        "an inlet that moves": surroundings.inlet.moves,
     }
     return ", ".join(reason for reason, true in reasons.items() if true)

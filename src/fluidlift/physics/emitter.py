@@ -25,7 +25,7 @@ from fluidlift.numerics.mesh_distance import MeshDistance, mesh_distance
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.numerics.solid_mesh import closed_mesh, moments
 from fluidlift.physics.boundaries import CLEARANCE, Walls
-from fluidlift.physics.inflow_schedule import InflowSchedule
+from fluidlift.physics.inflow_schedule import InflowSchedule, InletPath
 from fluidlift.types import Grid, TriangleMesh
 
 PHASES = np.array([0.7548776662466927, 0.5698402909980532])
@@ -87,6 +87,8 @@ class Supply:
     emitters: tuple[Emitter, ...] = ()
     looks: tuple[np.ndarray, ...] = ()
     """per emitter: the rest Gaussians that its particles take their look from, in turn; none at all: as at the inlet"""
+    path: InletPath | None = None
+    """of the inlet; None: it stays in its place"""
 
     def __post_init__(self) -> None:
         require(len(self.looks) in (0, len(self.emitters)), f"{len(self.looks)} looks", f"{len(self.emitters)}")

@@ -1,4 +1,5 @@
-"""The inflow over time: a factor on the inflow's velocity, between keyframes, with a surge of its own."""
+"""The inflow over time: a factor on the inflow's velocity, between keyframes, with a surge of its own; and where the
+inlet stands, as that of a jug in a hand."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from fluidlift.errors import require
 
@@ -65,3 +67,25 @@ class InflowSchedule:
         """The mean factor from `start` (s) over `duration` (s), by Simpson's rule."""
         ends = self.factor(start) + self.factor(start + duration)
         return (ends + 4.0 * self.factor(start + 0.5 * duration)) / 6.0
+
+
+@dataclass(frozen=True)
+class InletPath:
+    """Where the inlet stands over time, in whole cells from its own place: it goes there at once.
+
+    Raises:
+        ValueError: times that are not in order from 0 on, or not one place for each.
+    """
+
+    times: Float[np.ndarray, " n"]
+    """s, from which on it stands in a place"""
+    cells: Int[np.ndarray, "n 3"]
+
+    def __post_init__(self) -> None:
+        require(len(self.times) == len(self.cells) > 0, f"{len(self.cells)} places for {len(self.times)} times")
+        require(self.times[0] == 0.0 and bool((np.diff(self.times) > 0).all()), "times that are not in order from 0 on")
+
+    def at(self, time: float) -> tuple[int, int, int]:
+        """Cells from its own place at a time, s."""
+        x, y, z = self.cells[max(int(np.searchsorted(self.times, time, side="right")) - 1, 0)]
+        return int(x), int(y), int(z)

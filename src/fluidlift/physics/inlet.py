@@ -145,6 +145,16 @@ def _across_sheet(cells: Int[np.ndarray, "n 3"], down: Float[np.ndarray, "3"], l
     return vectors[:, int(values.argmin())]
 
 
+def _shifted(cells: Bool[np.ndarray, "nx ny nz"], by: tuple[int, int, int]) -> Bool[np.ndarray, "nx ny nz"]:
+    """Cells that are so many cells beside those given, as far as they are in the box."""
+    if not any(by):
+        return cells
+    out, index = np.zeros_like(cells), np.argwhere(cells) + by
+    index = index[((index >= 0) & (index < cells.shape)).all(axis=1)]
+    out[tuple(index.T)] = True
+    return out
+
+
 def beside_inlet(
     points: Float[np.ndarray, "n 3"], cell_types: Integer[np.ndarray, "nx ny nz"], grid: Grid, reach: float
 ) -> Bool[np.ndarray, " n"]:
@@ -217,7 +227,8 @@ class InletLattice:
 class Inlet:
     """What flows in: velocity as a function of place and time, and where new particles are due.
 
-    INFLOW cells make up the inlet proper; the emitters of the `supply` come and go.
+    INFLOW cells make up the inlet proper; the emitters of the `supply` come and go. Where the supply has a path, these
+    cells go along it, and those of the walls say where they are without it.
     """
 
     def __init__(
@@ -231,8 +242,11 @@ class Inlet:
     ) -> None:
         grid = walls.grid
         self._walls, self.supply = walls, supply or Supply()
-        self._cells = walls.regions == CellType.INFLOW
-        self._steady = bool(self._cells.any())
+        self._home = walls.regions == CellType.INFLOW
+        """the cells in their own place"""
+        self._steady = bool(self._home.any())
+        self._moved = (0, 0, 0)
+        """cells from there"""
         self.bulk = np.asarray(parameters.inflow_velocity, np.float64)
         self._amplitude = parameters.inflow_fluctuation
         self._per_side = max(1, round(per_cell ** (1.0 / 3.0)))
@@ -246,19 +260,28 @@ class Inlet:
         self._profile, self._gain, self._offset = profile, 0.0, self.bulk
         if not self._steady:
             return
-        index = np.argwhere(self._cells)
-        self._low, self._high = index.min(axis=0), index.max(axis=0) + 1
-        self._beside = ndimage.binary_dilation(self._cells, np.ones((3, 3, 3), bool))
-        self._numbers = self._lattice_of_cells(index - self._low)
+        index = np.argwhere(self._home)
         centers = grid.low + (index + 0.5) * grid.spacing
         if profile is not None:
             mean = sample_faces(profile, grid, centers).mean(axis=0, dtype=np.float64)
             size = float(np.linalg.norm(mean))
             self._gain = float(np.linalg.norm(self.bulk)) / size if size > 1e-6 else 0.0
             self._offset = self.bulk - self._gain * mean
-        extent = float((self._high - self._low).max()) * grid.spacing
+        extent = float((np.ptp(index, axis=0) + 1).max()) * grid.spacing
         rng = np.random.default_rng(seed)
         self._fluctuation = random_fluctuation(extent, 4 * grid.spacing, self.bulk, self._amplitude, rng)
+        if self.moves:
+            self._moved = self.supply.path.at(0.0)
+        self._lay()
+
+    def _lay(self) -> None:
+        """Find its cells, and their faces and places for particles, where it stands now."""
+        walls, grid = self._walls, self._walls.grid
+        self._cells = _shifted(self._home, self._moved)
+        index = np.argwhere(self._cells)
+        self._low, self._high = index.min(axis=0), index.max(axis=0) + 1
+        self._beside = ndimage.binary_dilation(self._cells, np.ones((3, 3, 3), bool))
+        self._numbers = self._lattice_of_cells(index - self._low)
         self._faces, self._face_points = [], []
         for axis, (touched, opening) in enumerate(zip(touching_faces(self._cells), walls.openings)):
             touched &= opening > 0
@@ -275,6 +298,16 @@ class Inlet:
             self._offset, self._profile, self._gain, self._amplitude, self._fluctuation, tuple(self._faces),
             tuple(self._face_points),
         )  # fmt: skip
+
+    @property
+    def moves(self) -> bool:
+        """Whether INFLOW cells go along a path."""
+        return self._steady and self.supply.path is not None
+
+    @property
+    def comes_and_goes(self) -> bool:
+        """Whether cells are inflow now that the walls do not have as such."""
+        return bool(self.running) or self.moves
 
     @property
     def has_cells(self) -> bool:
@@ -300,15 +333,21 @@ class Inlet:
         return np.min(lows, axis=0), np.max(highs, axis=0)
 
     def switch(self, time: float) -> bool:
-        """Turn emitters on and off as due at a time (s); whether that changed anything."""
+        """Turn emitters on and off, and move the inlet, as due at a time (s); whether that changed anything."""
         running = tuple(e for e in self.emissions if e.emitter.on(time))
         changed = running != self.running
         self.running = running
+        moved = self.supply.path.at(time) if self.supply.path is not None and self._steady else self._moved
+        if moved != self._moved and _shifted(self._home, moved).any():
+            self._moved, changed = moved, True
+            self._lay()
         return changed
 
     def emitter_cells(self, shape: tuple[int, ...], first: tuple[int, int, int] = (0, 0, 0)) -> np.ndarray:
-        """bool, of `shape`, from cell `first` on: cells of the emitters that are on."""
+        """bool, of `shape`, from cell `first` on: cells of the emitters that are on, and of an inlet that moves."""
         out = np.zeros(shape, bool)
+        if self.moves:
+            out[tuple((np.argwhere(self._cells) - first).T)] = True
         for e in self.running:
             out[tuple((e.cells - first).T)] = True
         return out
@@ -332,6 +371,8 @@ class Inlet:
         """Velocity [n,3] without the fluctuation and the schedule, m/s."""
         out = np.broadcast_to(self._offset, (len(points), 3)).copy()
         if self._profile is not None and self._gain > 0:
+            if any(self._moved):
+                points = points - np.multiply(self._moved, self._walls.grid.spacing)
             out += self._gain * sample_faces(self._profile, self._walls.grid, points)
         return out
 

@@ -193,7 +193,7 @@ class LiquidGrid:
         films = (types == CellType.FLUID) & (own != CellType.FLUID)
         distance = np.where(films, np.minimum(distance, np.float32(-SPRAY_DEPTH * grid.spacing)), distance)
         wet = (types == CellType.FLUID) | (types == CellType.INFLOW) | ((types == CellType.OUTFLOW) & occupied)
-        if self._inlet.running:  # the cells of emitters are inflow
+        if self._inlet.comes_and_goes:  # cells that are inflow just now
             cells, inflow = self._inlet.emitter_cells(grid.shape, region.first), np.uint8(CellType.INFLOW)
             holding, types = np.where(cells, inflow, holding), np.where(cells, inflow, types)
             wet = wet | cells

@@ -26,7 +26,7 @@ from fluidlift.physics.no_bodies import NoBodies
 from fluidlift.physics.refill import Refill
 from fluidlift.physics.rigid import RigidBodies
 from fluidlift.physics.surroundings import SimulationSettings, Surroundings
-from fluidlift.types import FaceVelocity, FluidParameters, Gaussians, Grid, Particles, SolveReport, Terrain
+from fluidlift.types import CellType, FaceVelocity, FluidParameters, Gaussians, Grid, Particles, SolveReport, Terrain
 
 TIDY_EVERY = 4
 """substeps between two tidyings: particles put in the order of their cells, thin and crowded cells reseeded"""
@@ -125,6 +125,9 @@ class ParticleSimulator(ABC):
         self._capacity = cell_capacity(terrain.signed_distance, grid)
         self._mainstream = np.asarray(terrain.mainstream, np.float64)
         self._inlet = Inlet(self._walls, parameters, inflow_profile, seed, settings.particles_per_cell, supply)
+        if self._inlet.moves:  # its cells are inflow where it stands
+            open_air = np.where(self._walls.regions == CellType.INFLOW, np.uint8(CellType.EMPTY), self._walls.regions)
+            self._walls = replace(self._walls, regions=open_air)
         self._surroundings = Surroundings(
             grid, parameters, settings, self._walls, self._capacity, self._mainstream, self._inlet
         )

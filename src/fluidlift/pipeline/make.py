@@ -31,6 +31,7 @@ from fluidlift.pipeline.stages.refine import refine
 from fluidlift.present.as_filmed import certainty
 from fluidlift.scene.build import SceneSettings, SimulationRequest, edited_scene, first_of_film
 from fluidlift.scene.filmed_cells import filmed_shares
+from fluidlift.scene.filmed_inlet import inlet_offsets
 from fluidlift.scene.simulator import particle_work
 from fluidlift.scene.splat_files import require_room
 from fluidlift.seams import Progress, Silence
@@ -167,9 +168,8 @@ def _write_asset(runner: Runner, lift: Lift, config: JobConfig, provenance: dict
         provenance=provenance | origin,
     )
     calibration = _calibrated(runner, lift, asset, config)
-    write_filmed(
-        folder, Filmed(calibration.force, calibration.dry, calibration.dry_for, calibration.wet, lift.motion.filmed)
-    )
+    known = calibration.force, calibration.dry, calibration.dry_for, calibration.wet
+    write_filmed(folder, Filmed(*known, lift.motion.filmed, _inlet_in_film(lift)))
     save_asset(
         folder,
         asset,
@@ -178,6 +178,18 @@ def _write_asset(runner: Runner, lift: Lift, config: JobConfig, provenance: dict
         warnings=runner.warnings,
     )
     return load_asset(folder)  # as everybody else finds it: files hold less digits
+
+
+def _inlet_in_film(lift: Lift) -> np.ndarray | None:
+    """float64 [T,3], m that the inlet of a pour stands beside its place at rest in each frame of the film."""
+    from fluidlift.io.footage_file import MOST_FRAMES
+
+    g = lift.geometry
+    if not kind_of(g.kind).fills_vessel:
+        return None
+    first = first_of_film(g.rest_frame, len(lift.clip))
+    fluid = FluidMasks(lift.labels.labels)[first : first + MOST_FRAMES]
+    return inlet_offsets(g.setting.cell_types, g.grid, g.camera, fluid, g.rest_frame - first)
 
 
 def _calibrated(runner: Runner, lift: Lift, asset: FluidAsset, config: JobConfig) -> Calibration:

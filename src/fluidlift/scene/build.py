@@ -144,6 +144,8 @@ class Scene:
     """s for which it is"""
     wet: np.ndarray | None = None
     """bool [nx,ny,nz]: cells that the clip shows wet throughout, which are filled where they run dry"""
+    inlet: np.ndarray | None = None
+    """[T,3], m that the inlet stands beside its place at rest in each frame of the film; None: it stays"""
     guide: FilmedMotion | None = None
     """on the faces of the terrain's grid, towards which the flow is drawn; None: it runs free"""
     guide_rates: tuple[np.ndarray, ...] = ()
@@ -203,6 +205,8 @@ class Scene:
             found["dry cells"] = _hash(self.dry, *[self.dry_for] * math.isfinite(self.dry_for))
         if self.wet is not None:
             found["wet cells"] = _hash(self.wet)
+        if self.inlet is not None:
+            found["inlet"] = _hash(self.inlet)
         if self.whitewater > 0:
             found["white water"] = _hash(self.whitewater, *["everywhere"] * self.whitewater_everywhere)
         if not self.skin:

@@ -77,7 +77,7 @@ def following(scene: Scene, asset: FluidAsset, filmed: Filmed, settings: SceneSe
         weight = settings.follow * untouched
         faded = FaceVelocity(*(_on_faces(weight, axis) * c for axis, c in enumerate(force.components)))
         dry, wet = (None if cells is None else cells & (untouched >= 1.0) for cells in (kept.dry, kept.wet))
-        scene = replace(scene, force=faded, dry=dry, dry_for=kept.dry_for, wet=wet)
+        scene = replace(scene, force=faded, dry=dry, dry_for=kept.dry_for, wet=wet, inlet=kept.inlet)
     if motion is None:
         return scene
     weight = settings.guide * pull_rate(scene, _typical_speed(motion)) * untouched
@@ -116,6 +116,7 @@ def _on_grid_of(asset: FluidAsset, filmed: Filmed) -> Filmed:
             filmed.dry_for,
             None if filmed.wet is None else _coarser(filmed.wet),
             None if filmed.motion is None else _coarser_motion(filmed.motion),
+            filmed.inlet,
         )
         shape = tuple(-(-n // 2) for n in shape)
     if shape != asset.grid.shape:

@@ -85,6 +85,7 @@ def simulator_of(
     """
     from fluidlift.physics.emitter import Supply
     from fluidlift.physics.surroundings import SimulationSettings
+    from fluidlift.scene.filmed_inlet import inlet_path
 
     crossed = BESIDE_OBSTACLES if scene.obstacles else CROSSED
     parameters, discharge = as_fast_as_filmed(scene, simulation_step(scene))
@@ -93,7 +94,8 @@ def simulator_of(
         settings = replace(settings, airy_above=level, airy=SPRAY)
     own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
     look = inflow_look(scene, own, float(np.linalg.norm(parameters.inflow_velocity)))
-    grid, supply = scene.terrain.grid, Supply(scene.inflow, scene.emitters, scene.emitter_looks)
+    supply = Supply(scene.inflow, scene.emitters, scene.emitter_looks, inlet_path(scene))
+    grid = scene.terrain.grid
     if kind_of(scene.kind).is_gas:
         from fluidlift.physics.gas import GasSimulator
 

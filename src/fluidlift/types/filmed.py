@@ -72,3 +72,5 @@ class Filmed:
     """cells that it shows wet throughout; None: not known"""
     motion: FilmedMotion | None = None
     """that a simulation can be guided by; None: it was not asked for"""
+    inlet: Float[np.ndarray, "t 3"] | None = None
+    """m that the inlet stands beside its place at rest in each frame of the film; None: it stays"""

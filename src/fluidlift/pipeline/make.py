@@ -11,6 +11,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fluidlift import __version__
 from fluidlift.config import JobConfig
 from fluidlift.io.hints_file import hints_data

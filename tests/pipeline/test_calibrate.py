@@ -161,7 +161,8 @@ def test_a_coarser_copy_gets_a_coarser_force(tmp_path, made):
     grid = load_asset(made.folder).grid
     dry = np.zeros(grid.shape, bool)
     dry[:4, :3] = True
-    write_filmed(tmp_path, Filmed(uniform(grid, (1.0, 2.0, 3.0)), dry, 0.4, dry[::-1]))
+    way = np.linspace(0.0, 0.3, 12).reshape(4, 3)
+    write_filmed(tmp_path, Filmed(uniform(grid, (1.0, 2.0, 3.0)), dry, 0.4, dry[::-1], inlet=way))
     (tmp_path / "empty").mkdir()
     scene = scene_of(asset, tmp_path / "empty", SimulationRequest(meshes=tmp_path), JobConfig(), footage=None, start=0)
     assert scene.force.shape == asset.grid.shape
@@ -169,6 +170,7 @@ def test_a_coarser_copy_gets_a_coarser_force(tmp_path, made):
     assert scene.dry.shape == asset.grid.shape and scene.dry[:2, 0].all() and not scene.dry[2:].any()
     assert not scene.dry[:, 1:].any(), "a wide cell is dry where all of it is"
     assert scene.dry_for == 0.4
+    np.testing.assert_allclose(scene.inlet, way, atol=1e-6)
     assert scene.wet.any() and not (scene.wet & scene.dry).any(), "cells that stay wet are kept beside them"
 
 
@@ -179,6 +181,18 @@ def test_a_damaged_force_is_refused_with_what_to_do(tmp_path):
         read_filmed(tmp_path)
     np.savez(tmp_path / FILES["force"], u=np.zeros((3, 2, 2)), v=np.zeros((2, 2, 2)), w=np.zeros((2, 2, 3)))
     with pytest.raises(InputRejected, match="make the asset again"):
+        read_filmed(tmp_path)
+
+
+@pytest.mark.parametrize("inlet", [np.zeros((4, 2), np.float32), np.full((4, 3), np.nan, np.float32), np.zeros((4, 3)),
+                                   np.zeros((0, 3), np.float32), np.zeros((100_000, 3), np.float32)])  # fmt: skip
+def test_a_way_of_the_inlet_that_is_none_is_refused(tmp_path, inlet):
+    (tmp_path / "rest").mkdir()
+    force = {"u": np.zeros((3, 2, 2)), "v": np.zeros((2, 3, 2)), "w": np.zeros((2, 2, 3))}
+    np.savez(tmp_path / FILES["force"], **force)
+    assert read_filmed(tmp_path).inlet is None
+    np.savez(tmp_path / FILES["force"], **force, inlet=inlet)
+    with pytest.raises(InputRejected, match=r"inlet|finite"):
         read_filmed(tmp_path)
 
 

@@ -23,7 +23,7 @@ Modules of the face:
     guidance              Nudging and other body forces that depend on place: a pull towards a known flow, a steady
                           one that keeps it, and one that goes through a film
     inflow_schedule       The inflow over time: a factor on the inflow's velocity, between keyframes, with a surge
-                          of its own
+                          of its own; and where the inlet stands, as that of a jug in a hand
     inlet                 The inlet: Dirichlet velocity in INFLOW cells (paper: v_in, v~_in) and gap-free emission
                           of particles
     liquid_grid           The grid half of a liquid's substep: from particles to the new velocity on all faces near

@@ -270,7 +270,7 @@ class Inlet:
         extent = float((np.ptp(index, axis=0) + 1).max()) * grid.spacing
         rng = np.random.default_rng(seed)
         self._fluctuation = random_fluctuation(extent, 4 * grid.spacing, self.bulk, self._amplitude, rng)
-        if self.moves:
+        if self.supply.path is not None:
             self._moved = self.supply.path.at(0.0)
         self._lay()
 

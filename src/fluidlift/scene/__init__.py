@@ -9,6 +9,8 @@ Modules of the face:
     edits               Edits of an asset: one model behind scene.yaml, the command line, Python and the viewer
     filmed_cells        Cells in which the clip shows no fluid at any time, and those in which it shows some at all
                         times
+    filmed_inlet        Where an inlet stood in each frame of a clip: what pours out of a jug comes from where a
+                        hand holds that
     filmed_numbers      What a film says of its foam and waves, as numbers with intervals, for the parameters of an
                         asset
     footage             The clip that an asset comes from, where it is still at hand
@@ -63,7 +65,7 @@ def __getattr__(name: str) -> _Any:
 
 __all__ = [
     "Add", "Change", "EditSession", "Remove", "Scene", "Set", "SimulationRequest", "build", "coarse_copy",
-    "edit_history", "edited_scene", "edits", "filmed_cells", "filmed_numbers", "footage", "force_weight", "forecast",
-    "open_water", "recall", "reshaping", "scene_of", "simulated_history", "simulation", "simulator",
-    "simulator_of", "smoke_appearance", "splat_files", "surface_appearance", "waves", "whitewater", "whitewater_law",
+    "edit_history", "edited_scene", "edits", "filmed_cells", "filmed_inlet", "filmed_numbers", "footage",
+    "force_weight", "forecast", "open_water", "recall", "reshaping", "scene_of", "simulated_history", "simulation",
+    "simulator", "simulator_of", "smoke_appearance", "splat_files", "surface_appearance", "waves", "whitewater", "whitewater_law",
 ]  # fmt: skip

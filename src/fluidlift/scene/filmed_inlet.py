@@ -87,7 +87,7 @@ def _shifts(
         last_seen = np.zeros(2)
         for t in way:
             # what hangs from the picture's edge goes on beyond it
-            wide = cv2.copyMakeBorder(masks[t].astype(np.float32), *[reach] * 4, cv2.BORDER_REPLICATE)
+            wide = np.pad(masks[t].astype(np.float32), reach, mode="edge")
             part = wide[first[1] : last[1] + 2 * reach, first[0] : last[0] + 2 * reach]
             both, there = (cv2.matchTemplate(part, image, cv2.TM_CCORR) for image in (shown, ones))
             gone = np.hypot(places[:, None] - last_seen[1], places[None, :] - last_seen[0])

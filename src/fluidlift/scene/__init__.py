@@ -67,5 +67,6 @@ __all__ = [
     "Add", "Change", "EditSession", "Remove", "Scene", "Set", "SimulationRequest", "build", "coarse_copy",
     "edit_history", "edited_scene", "edits", "filmed_cells", "filmed_inlet", "filmed_numbers", "footage",
     "force_weight", "forecast", "open_water", "recall", "reshaping", "scene_of", "simulated_history", "simulation",
-    "simulator", "simulator_of", "smoke_appearance", "splat_files", "surface_appearance", "waves", "whitewater", "whitewater_law",
+    "simulator", "simulator_of", "smoke_appearance", "splat_files", "surface_appearance", "waves", "whitewater",
+    "whitewater_law",
 ]  # fmt: skip

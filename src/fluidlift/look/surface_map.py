@@ -89,13 +89,17 @@ class SurfaceMap:
         """A field of the map at some places (x, y in m), between its columns by their distance."""
         return sampled(field, np.asarray(places, np.float64), first=self.low, apart=self.pitch, middle=0.5)
 
+    def column_of(self, places: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of the columns that hold places (x, y in m), or are nearest to them."""
+        row, column = np.clip(((places - self.low) / self.pitch).astype(np.int64), 0, np.array(self.wet.shape) - 1).T
+        return row, column
+
     def mean(
         self, values: Float[np.ndarray, " n"], places: Float[np.ndarray, "n 2"], elsewhere: float
     ) -> Float[np.ndarray, "nx ny"]:
         """Field of the map with the mean of the values of the places (x, y in m) in each column; `elsewhere` in columns
         without any."""
-        index = np.clip(((places - self.low) / self.pitch).astype(np.int64), 0, np.array(self.wet.shape) - 1)
-        column, n = np.ravel_multi_index(tuple(index.T), self.wet.shape), self.wet.size
+        column, n = np.ravel_multi_index(self.column_of(places), self.wet.shape), self.wet.size
         count = np.bincount(column, minlength=n)
         found = np.where(count > 0, np.bincount(column, values, minlength=n) / np.maximum(count, 1), elsewhere)
         return found.reshape(self.wet.shape)

@@ -157,7 +157,8 @@ class SurfaceSkin:
 
     Args:
         cell: width of the simulator's cells, m.
-        level_at: (places [n,2] m) -> level of the tracers there, 0 to `FINEST`; None: 0 everywhere.
+        level_at: (places [n,2] m) -> level of the tracers there, 0 to `FINEST`; None: 0 everywhere. It is asked for the
+            middles of the map's columns, all of whose tracers are of that level.
 
     Raises:
         ValueError: a width that is not positive.
@@ -178,25 +179,21 @@ class SurfaceSkin:
 
     def advance(self, surface: SurfaceMap, interval: float, rng: np.random.Generator) -> None:
         """Float with the surface for an interval (s), and fill what has come apart."""
-        velocity = surface.at(surface.velocity, self.places)
+        columns, velocity = self._levels(surface), surface.at(surface.velocity, self.places)
         self.places = self.places + interval * velocity[:, :2]
-        levels, height = self._levels(self.places), surface.at(surface.height, self.places)
+        levels, height = columns[surface.column_of(self.places)], surface.at(surface.height, self.places)
         risen = np.abs(height - np.where(np.isfinite(self.heights), self.heights, height))
         stays = risen <= JUMP * self._cell + SPEEDS * interval * np.linalg.norm(velocity, axis=1)
         self._keep((surface.presence(self.places) > 0.5) & (levels == self.levels) & stays)
         if surface.wet.any():
-            self._fill_all(surface, rng)
+            self._fill_all(surface, columns, rng)
         self.heights = surface.at(surface.height, self.places)
 
-    def _fill_all(self, surface: SurfaceMap, rng: np.random.Generator) -> None:
-        columns = self._levels(surface.middles().reshape(-1, 2)).reshape(surface.wet.shape)
-        # a place is as far from the camera as the four columns around it, or between them; on a ridge slopes cancel
-        # out between two columns, where a slope (blurred over three) is at most a level less than beside it
-        least, most = ndimage.minimum_filter(columns, 3) - 1, ndimage.maximum_filter(columns, 3)
+    def _fill_all(self, surface: SurfaceMap, columns: Int[np.ndarray, "nx ny"], rng: np.random.Generator) -> None:
         found = np.unique(columns[surface.wet])
         self._thin_out(found)
         for level in found:
-            self._fill(surface, int(level), (least <= level) & (level <= most), rng)
+            self._fill(surface, int(level), columns == level, rng)
 
     def _thin_out(self, found: Int[np.ndarray, " k"]) -> None:
         """Tracers of some levels go where they are crowded."""
@@ -209,12 +206,9 @@ class SurfaceSkin:
         self._keep(keep)
 
     def _fill(
-        self, surface: SurfaceMap, level: int, about: Bool[np.ndarray, "nx ny"], rng: np.random.Generator
+        self, surface: SurfaceMap, level: int, where: Bool[np.ndarray, "nx ny"], rng: np.random.Generator
     ) -> None:
-        """Tracers of a level come where they are drawn apart.
-
-        `about` says in which columns of the map there can be places of that level.
-        """
+        """Tracers of a level come where they are drawn apart, in some of the columns of the map."""
         spacing, own = PITCH * self._cell * float(finer(level)), np.flatnonzero(self.levels == level)
         low = np.floor(surface.low / spacing)
         count = np.ceil(np.array(surface.wet.shape) * surface.pitch / spacing).astype(int) + 1
@@ -222,12 +216,11 @@ class SurfaceSkin:
         bare = bare_points(rows(self.places, own), low, spacing, (int(count[0]), int(count[1])), BARE * spacing)
         column = [
             np.clip(np.floor(((low[a] + np.arange(n) + 0.5) * spacing - surface.low[a]) / surface.pitch), 0, most - 1)
-            for a, (n, most) in enumerate(zip(bare.shape, about.shape, strict=True))
+            for a, (n, most) in enumerate(zip(bare.shape, where.shape, strict=True))
         ]
-        bare &= about[np.ix_(*(c.astype(int) for c in column))]
+        bare &= where[np.ix_(*(c.astype(int) for c in column))]
         lattice = (low + np.argwhere(bare) + 0.5) * spacing
         lattice = lattice[surface.presence(lattice) > 0.5]
-        lattice = lattice[self._levels(lattice) == level]
         fresh = lattice + rng.uniform(-0.25, 0.25, lattice.shape) * spacing
         self.places = np.concatenate([self.places, fresh])
         self.ids = np.concatenate([self.ids, self.next_id + np.arange(len(fresh))])
@@ -235,8 +228,11 @@ class SurfaceSkin:
         self.heights = np.concatenate([self.heights, np.full(len(fresh), np.nan)])
         self.next_id += len(fresh)
 
-    def _levels(self, places: np.ndarray) -> np.ndarray:
-        return np.zeros(len(places), np.int64) if self._level_at is None else self._level_at(places)
+    def _levels(self, surface: SurfaceMap) -> Int[np.ndarray, "nx ny"]:
+        """That of the tracers in each column of the map."""
+        if self._level_at is None:
+            return np.zeros(surface.wet.shape, np.int64)
+        return self._level_at(surface.middles().reshape(-1, 2)).reshape(surface.wet.shape)
 
     def _keep(self, index: np.ndarray) -> None:
         if index.all():

@@ -108,6 +108,14 @@ class SurfaceMap:
         """How much of the surroundings of places (m) is liquid: 1/2 on a straight shore."""
         return self.at(self._share, places)
 
+    def height_and_presence(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 n"]:
+        """Of the surface at places (m), as `at` and `presence` have them, in one go."""
+        return self.at(self._height_and_share, places).T
+
+    @cached_property
+    def _height_and_share(self) -> Float[np.ndarray, "nx ny 2"]:
+        return np.stack([self.height, self._share], axis=-1)
+
     @cached_property
     def _share(self) -> Float[np.ndarray, "nx ny"]:
         """Of the surroundings of each column that is wet: asked for again and again in a frame."""

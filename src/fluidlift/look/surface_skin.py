@@ -172,6 +172,8 @@ class SurfaceSkin:
         self.heights: Float[np.ndarray, " n"] = np.zeros(0)
         """m, at which they were last; nan: not yet"""
         self.next_id = 0
+        self._floats_on: SurfaceMap | None = None
+        """the map at which `heights` were taken"""
         self._cell, self._level_at = cell, level_at
 
     def __len__(self) -> int:
@@ -181,13 +183,13 @@ class SurfaceSkin:
         """Float with the surface for an interval (s), and fill what has come apart."""
         columns, velocity = self._levels(surface), surface.at(surface.velocity, self.places)
         self.places = self.places + interval * velocity[:, :2]
-        levels, height = columns[surface.column_of(self.places)], surface.at(surface.height, self.places)
+        levels, (height, presence) = columns[surface.column_of(self.places)], surface.height_and_presence(self.places)
         risen = np.abs(height - np.where(np.isfinite(self.heights), self.heights, height))
         stays = risen <= JUMP * self._cell + SPEEDS * interval * np.linalg.norm(velocity, axis=1)
-        self._keep((surface.presence(self.places) > 0.5) & (levels == self.levels) & stays)
+        self.heights, self._floats_on = height, surface
+        self._keep((presence > 0.5) & (levels == self.levels) & stays)
         if surface.wet.any():
             self._fill_all(surface, columns, rng)
-        self.heights = surface.at(surface.height, self.places)
 
     def _fill_all(self, surface: SurfaceMap, columns: Int[np.ndarray, "nx ny"], rng: np.random.Generator) -> None:
         found = np.unique(columns[surface.wet])
@@ -225,7 +227,7 @@ class SurfaceSkin:
         self.places = np.concatenate([self.places, fresh])
         self.ids = np.concatenate([self.ids, self.next_id + np.arange(len(fresh))])
         self.levels = np.concatenate([self.levels, np.full(len(fresh), level)])
-        self.heights = np.concatenate([self.heights, np.full(len(fresh), np.nan)])
+        self.heights = np.concatenate([self.heights, surface.at(surface.height, fresh)])
         self.next_id += len(fresh)
 
     def _levels(self, surface: SurfaceMap) -> Int[np.ndarray, "nx ny"]:
@@ -243,7 +245,8 @@ class SurfaceSkin:
 
     def points(self, surface: SurfaceMap) -> Float[np.ndarray, "n 3"]:
         """Where the tracers are, m."""
-        return np.concatenate([self.places, surface.at(surface.height, self.places)[:, None]], axis=1)
+        heights = self.heights if surface is self._floats_on else surface.at(surface.height, self.places)
+        return np.concatenate([self.places, heights[:, None]], axis=1)
 
     def splats(self, surface: SurfaceMap, colors: Float[np.ndarray, "n 3"]) -> Gaussians:
         """Flat splats that lie on the surface now, in sRGB colours (of each tracer) from any side."""

@@ -16,7 +16,7 @@ from fluidlift.numerics.sharing import shared
 WIDER = 3.0
 """times as wide are the cells in which places are looked up that are alone"""
 MOST_PAIRS = 30_000_000
-"""of places that are alone and points, beyond which a tree is faster than cells that come to hold all points"""
+"""of places that are alone and points in the 27 cells around them, beyond which a tree is faster"""
 
 FEW = 100
 """points, or places, up to which looking at all points is faster than a tree: the 8 nearest of 60,000 places in the
@@ -106,27 +106,28 @@ def nearest_of_crowd(
     require(0 < count <= len(points), f"{count} neighbours among {len(points)} points", "at most as many as there are")
     if not len(places):
         return np.empty((0, count)), np.empty((0, count), np.int64)
-    distance, index = _in_cells(points, np.ascontiguousarray(places), count, width)
+    distance, index = _in_cells(CellList.of(points, width), points, np.ascontiguousarray(places), count)
     # what is within a width of a place lies in the 27 cells around it; what is farther may not
     left = np.flatnonzero(distance[:, -1] > width)
     while len(left):
         width *= WIDER
-        if len(left) * len(points) > MOST_PAIRS:
+        cells = CellList.of(points, width)
+        held = len(points) / max(np.count_nonzero(np.diff(cells.starts)), 1)
+        if 27.0 * held * len(left) > MOST_PAIRS:
             found = nearest(points, places[left], count, workers=-1)
             distance[left], index[left] = (np.reshape(a, (len(left), count)) for a in found)
             break
-        found = _in_cells(points, places.take(left, axis=0), count, width)
+        found = _in_cells(cells, points, places.take(left, axis=0), count)
         distance[left], index[left] = found
         left = left[found[0][:, -1] > width]
     return distance, index
 
 
-def _in_cells(points: np.ndarray, places: np.ndarray, count: int, width: float) -> tuple[np.ndarray, np.ndarray]:
+def _in_cells(cells: CellList, points: np.ndarray, places: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """The nearest of the points in the 27 cells around each place; at infinity where there are too few."""
-    cells = CellList.of(points, width)
     distance, index = np.empty((len(places), count)), np.zeros((len(places), count), np.int64)
     # neighbouring places one after the other: what they look at is in the cache already
-    turn = CellList.of(places, width).order
+    turn = CellList.of(places, cells.width).order
     _nearest_kernel(
         places, turn, points.take(cells.order, axis=0), cells.order, cells.starts, cells.low, cells.width,
         cells.shape, distance, index,

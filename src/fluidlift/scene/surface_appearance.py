@@ -518,9 +518,10 @@ class SurfaceAppearance:
 
         places = self._axes.points(particles.positions)
         xy = places[:, :2]
-        above = (places[:, 2] - surface.at(surface.height, xy)) / self._cell
+        height, presence = surface.height_and_presence(xy)
+        above = (places[:, 2] - height) / self._cell
         below, spray = COVERED
-        loose, presence = smoothstep(above, *spray), surface.presence(xy)
+        loose = smoothstep(above, *spray)
         covered = smoothstep(above, *below) * (1 - loose) * (presence > 0.5)
         hidden = self._hidden(particles.positions)
         loose = np.where((presence > LONELY) | hidden, loose * ~hidden, 1.0)

@@ -12,6 +12,7 @@ from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.physics.apic import SimulationSettings
 from fluidlift.physics.emitter import Emitter, Supply
 from fluidlift.physics.guidance import BodyForce, SteadyForce
+from fluidlift.physics.inflow_schedule import InletPath
 from fluidlift.physics.numba_particles import ParticleWork
 from fluidlift.physics.rigid_body import RigidBody
 from fluidlift.synthetic import tanks
@@ -222,11 +223,13 @@ def test_the_host_keeps_what_the_device_cannot_do():
     work, tank = ParticleWork(liquid=WarpLiquids("cpu")), dam()
     ball = RigidBody.sphere("ball", 0.1)
     tense = replace(tank, parameters=replace(tank.parameters, surface_tension=0.07))
+    still = InletPath(np.zeros(1), np.zeros((1, 3), int))
     reasons = {
         "surface tension": tense.simulator(work=work),
         "a force of its own kind": tank.simulator(work=work, forces=[Whim()]),
         "a prescribed outflow": tank.simulator(work=work, settings=SimulationSettings(prescribe_outflow=True)),
         "drops that fly": tank.simulator(work=work, settings=SimulationSettings(airy_above=0.5)),
+        "an inlet that moves": tanks.river(cells=16).simulator(work=work, supply=Supply(path=still)),
         "rigid bodies": tanks.pool(cells=12).with_bodies(ball).simulator(work=work),
     }
     for reason, simulator in reasons.items():

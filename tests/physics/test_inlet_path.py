@@ -98,6 +98,9 @@ def test_it_goes_on_from_a_state_where_it_stands_then_and_stays_in_the_box():
         again.advance(0.02)
     np.testing.assert_array_equal(moves.particles.positions, again.particles.positions)
     assert under(moves, 17 * H).max() < 12 * H, "beyond the box there is no place: it stays where it was"
+    away = jet(along_x((0.0, -100)))
+    away.advance(0.02)
+    assert len(away.particles) > 100
 
 
 @pytest.mark.parametrize(

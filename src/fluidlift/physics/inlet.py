@@ -270,9 +270,8 @@ class Inlet:
         extent = float((np.ptp(index, axis=0) + 1).max()) * grid.spacing
         rng = np.random.default_rng(seed)
         self._fluctuation = random_fluctuation(extent, 4 * grid.spacing, self.bulk, self._amplitude, rng)
-        if self.supply.path is not None:
-            self._moved = self.supply.path.at(0.0)
         self._lay()
+        self._go_along(0.0)
 
     def _lay(self) -> None:
         """Find its cells, and their faces and places for particles, where it stands now."""
@@ -337,11 +336,18 @@ class Inlet:
         running = tuple(e for e in self.emissions if e.emitter.on(time))
         changed = running != self.running
         self.running = running
-        moved = self.supply.path.at(time) if self.supply.path is not None and self._steady else self._moved
-        if moved != self._moved and _shifted(self._home, moved).any():
-            self._moved, changed = moved, True
-            self._lay()
-        return changed
+        return self._go_along(time) or changed
+
+    def _go_along(self, time: float) -> bool:
+        """Stand where the path has it at a time (s), unless that is beyond the box; whether that is another place."""
+        if self.supply.path is None or not self._steady:
+            return False
+        moved = self.supply.path.at(time)
+        if moved == self._moved or not _shifted(self._home, moved).any():
+            return False
+        self._moved = moved
+        self._lay()
+        return True
 
     def emitter_cells(self, shape: tuple[int, ...], first: tuple[int, int, int] = (0, 0, 0)) -> np.ndarray:
         """bool, of `shape`, from cell `first` on: cells of the emitters that are on, and of an inlet that moves."""

@@ -54,9 +54,10 @@ def inlet_offsets(
     if ndimage.label(ndimage.binary_dilation(inlet, beside), beside)[1] != 1:
         return None
     uv, depth = camera.project(grid.low + (np.argwhere(inlet) + 0.5) * grid.spacing)
-    away, across = float(np.median(depth)), grid.spacing * camera.focal[0] / float(np.median(depth))
+    away = float(np.median(depth))
     if away <= 0:
         return None
+    across = grid.spacing * camera.focal[0] / away
     low, high = uv.min(axis=0) - 0.5 * across, uv.max(axis=0) + 0.5 * across
     shifts = _shifts(masks, rest, low, high)
     if shifts is None:

@@ -508,6 +508,29 @@ def test_in_a_shaken_picture_the_fluid_grows_from_where_it_streams():
     assert overlap(grown, puddle) > 0.85
 
 
+def test_fluid_that_fills_its_picture_grows_over_what_does_not_stream():
+    """Three quarters of the picture, in two tones; an eighth of it streams, in the brighter one."""
+    rng = np.random.default_rng(8)
+    columns = np.mgrid[0:HEIGHT, 0:WIDTH][1]
+    fluid = columns < 120
+    bank = np.array([90.0, 125.0, 60.0]) + 40.0 * texture(rng, (HEIGHT, WIDTH), sigma=1.2)[..., None]
+    water = np.array([150.0, 150.0, 155.0]) - 10.0 * (columns < 60)[..., None]
+    water = water + 10.0 * texture(rng, (HEIGHT, WIDTH), sigma=2.0)[..., None]
+    pattern = 25.0 * texture(rng, (HEIGHT, WIDTH), sigma=2.0)[..., None]
+    pictures, flow, still = still_room(rng), no_flow(), np.where(fluid[..., None], water, bank)
+    for t in range(FRAMES):
+        picture = still.copy()
+        picture[:, 75:105] += np.roll(pattern, 2 * t, axis=0)[:, 75:105]
+        pictures[t] = shift(picture, (*rng.normal(scale=0.8, size=2), 0.0), order=1, mode="nearest")
+    flow.displacement[:, :, 75:105, 1] = 2.0
+    evidence = gather_evidence(clip_of(pictures), flow)
+    everywhere = np.ones((HEIGHT, WIDTH), bool)
+    found = [grown_from_streams(evidence, everywhere, against=odds) for odds in (0.0, 1.0)]
+    assert all(f is not None for f in found)
+    kept, other = (overlap(f, fluid) for f in found)
+    assert kept > 0.9 > other
+
+
 def test_what_moves_as_a_solid_is_left_out_where_fluid_grows():
     pictures, puddle = shaken_honey()
     flow = no_flow()

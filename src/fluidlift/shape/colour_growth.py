@@ -29,7 +29,9 @@ DIRECT = 0.15
 RIM = 0.04
 """part of the longer side: a stabilised picture is made up at its rim, nothing there is a seed"""
 SCARCE = 1.0
-"""log odds against fluid of a place that does not stream"""
+"""log odds against fluid of a place near a jet that does not stream. In a whole picture it says nothing: of a fluid's
+own places 1 to 36 in 100 stream (14 parts of clips). Of 0, 0.5 and 1, masks of these have a mean IoU of 0.55, 0.49 and
+0.41, of 9 other parts 0.66, 0.62 and 0.60, of 6 whole clips 0.58, 0.56 and 0.53"""
 CLEAR = 2.0
 """weight of colour against streaming, which marks few places"""
 AROUND = 0.02
@@ -88,7 +90,9 @@ def with_quiet_water(picture: np.ndarray, score: np.ndarray, region: np.ndarray,
     return found
 
 
-def grown_from_streams(evidence: Evidence, inside: np.ndarray, *, rounds: int = 10) -> np.ndarray | None:
+def grown_from_streams(
+    evidence: Evidence, inside: np.ndarray, *, rounds: int = 10, against: float = 0.0
+) -> np.ndarray | None:
     """bool [h,w]: what has the colours of the places that stream and hangs together with them; None without any.
 
     For clips in which the camera or its stabilisation moves everything a little: change tells nothing there, but
@@ -98,6 +102,7 @@ def grown_from_streams(evidence: Evidence, inside: np.ndarray, *, rounds: int = 
         evidence: of the clip.
         inside: bool [h,w], where to look.
         rounds: at most, in which the colours are read anew.
+        against: log odds against fluid of a place that does not stream.
     """
     picture = evidence.typical
     rim = max(1, round(RIM * max(inside.shape)))
@@ -107,7 +112,7 @@ def grown_from_streams(evidence: Evidence, inside: np.ndarray, *, rounds: int = 
     if float(streaming.max()) < DIRECT or (streaming > DIRECT).mean() < 1e-3:
         return None
     seeds = np.clip(streaming / DIRECT, 0.0, 1.0)
-    motion = 6.0 * streaming / float(streaming.max()) - SCARCE
+    motion = 6.0 * streaming / float(streaming.max()) - against
     across, down = edge_weights(picture, STIFFNESS)
     fluid, other = seeds, (streaming < 0.1 * DIRECT).astype(np.float32)
     before = None
@@ -141,7 +146,7 @@ def still_below_jet(evidence: Evidence, region: np.ndarray, inside: np.ndarray) 
     hull = np.zeros(region.shape, np.uint8)
     cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(region)[:, ::-1].astype(np.int32)), 1)
     near = cv2.dilate(hull, disc(AROUND * max(region.shape))) > 0
-    grown = grown_from_streams(evidence, inside & near, rounds=FEW_ROUNDS)
+    grown = grown_from_streams(evidence, inside & near, rounds=FEW_ROUNDS, against=SCARCE)
     if grown is None:
         return none
     jet = jet_rows(grown)

@@ -184,14 +184,20 @@ def _write_asset(runner: Runner, lift: Lift, config: JobConfig, provenance: dict
 
 def _inlet_in_film(lift: Lift) -> np.ndarray | None:
     """float64 [T,3], m that the inlet of a pour stands beside its place at rest in each frame of the film."""
-    from fluidlift.io.footage_file import MOST_FRAMES
-
     g = lift.geometry
     if not kind_of(g.kind).fills_vessel:
         return None
-    first = first_of_film(g.rest_frame, len(lift.clip))
-    fluid = FluidMasks(lift.labels.labels)[first : first + MOST_FRAMES]
-    return inlet_offsets(g.setting.cell_types, g.grid, g.camera, fluid, g.rest_frame - first)
+    part = _film_part(lift)
+    fluid = FluidMasks(lift.labels.labels)[part]
+    return inlet_offsets(g.setting.cell_types, g.grid, g.camera, fluid, g.rest_frame - part.start)
+
+
+def _film_part(lift: Lift) -> slice:
+    """Frames of the clip that the film holds."""
+    from fluidlift.io.footage_file import MOST_FRAMES
+
+    first = first_of_film(lift.geometry.rest_frame, len(lift.clip))
+    return slice(first, first + MOST_FRAMES)
 
 
 def _calibrated(runner: Runner, lift: Lift, asset: FluidAsset, config: JobConfig) -> Calibration:
@@ -211,11 +217,9 @@ def _calibrated(runner: Runner, lift: Lift, asset: FluidAsset, config: JobConfig
 def _write_film(lift: Lift, folder: Path) -> None:
     """The film that the fluid's surface plays; of smoke, its color and opacity."""
     from fluidlift.io.asset_folder import FILES
-    from fluidlift.io.footage_file import MOST_FRAMES, write_footage, write_smoke
+    from fluidlift.io.footage_file import write_footage, write_smoke
 
-    film, clip = folder / FILES["film"], lift.clip
-    first = first_of_film(lift.geometry.rest_frame, len(clip))
-    part = slice(first, first + MOST_FRAMES)
+    film, clip, part = folder / FILES["film"], lift.clip, _film_part(lift)
     frames, fluid, hidden = clip.frames[part], FluidMasks(lift.labels.labels)[part], lift.geometry.hidden
     if hidden is not None:
         behind = HiddenFluid.of(hidden, lift.geometry.mask)

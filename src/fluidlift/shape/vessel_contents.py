@@ -87,7 +87,7 @@ AFLOAT = 0.8
 before it reaches beyond the rim"""
 WIDER = 3.0
 """times as wide as where it is seen before a vessel's wall a jet is above it, at most: falling, it draws in as the root
-of its speed, here from a ninth of that. What is wider is what it is poured from"""
+of its speed, here from a ninth of that (a choice). What is wider is what it is poured from"""
 MARGIN = 1.04
 """radii to which what is seen within a rim may be marked over it"""
 

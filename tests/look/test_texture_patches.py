@@ -286,12 +286,12 @@ def test_pairs_at_home_are_those_that_are_looked_up_like_any_other(seen_in):
     """A patch a picometre from its own place is asked for its source as one from elsewhere is: the plain way."""
     if seen_in == "plan":
         where = surface(uniform(0.5))
-        patches = TexturePatches(SeenTexture(sheet(), CAMERA, where), 0.6, footage=FILM, start=9.0)
-        for k, interval in enumerate([0.0, *[STEP] * 12]):
+        patches = TexturePatches(SeenTexture(sheet(), CAMERA, where), 0.6, footage=FILM, start=40.0)
+        for k, interval in enumerate([0.0, *[STEP] * 12]):  # into the fade at the film's end
             patches.advance(where, interval, np.random.default_rng(k))
         points = CAMERA.unproject(pixels()[1][:, ::-1] + 0.5, np.full(len(pixels()[1]), 9.4))
     else:
-        patches, points = played(12, start=9.0), pixels()[0]
+        patches, points = played(12, start=40.0), pixels()[0]
     fast = patches.colors(points)
     s = patches.state
     assert len(np.unique(s.instants)) > 3 and (s.sources == s.centers).all()
@@ -352,6 +352,22 @@ def test_after_the_films_end_other_patches_play():
     assert max(latest) <= last
     assert np.ptp(patches.state.instants) > 0.3 * last, "of many instants, where the first ones were of one"
     assert (patches.state.instants < 60).all()
+
+
+def test_until_its_film_ends_each_place_shows_the_instant_that_was_filmed():
+    """So that what nobody edited goes with the frames of the clip; then places part, and do not end at once again."""
+    film = noise_film(36)
+    seen = upright(uniform(0.5))
+    patches = TexturePatches(PictureTexture(AXES, seen, film), 0.6, footage=film)
+    begun = []
+    for k in range(80):
+        patches.advance(seen, STEP if k else 0.0, np.random.default_rng([7, k]))
+        if k < len(film) - 1 - 6:  # frames of a fade
+            np.testing.assert_allclose(patches.state.instants, k, atol=1e-9)
+        begun.append(int((patches.state.presences < 1.1 / 6).sum()))
+    count = len(np.unique(patches.state.centers, axis=0))
+    assert begun[: len(film) - 8] == [0] * (len(film) - 8) and max(begun[:40]) == count
+    assert count > 10 and 0 < max(begun[42:]) < 0.6 * count
 
 
 def drifting_film(count: int, speed: float) -> FluidFootage:

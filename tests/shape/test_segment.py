@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter, shift
 
 from fluidlift.errors import InputRejected
 from fluidlift.messages import code_of
-from fluidlift.shape.colour_growth import colour_odds, grown_from_streams, with_quiet_water
+from fluidlift.shape.colour_growth import colour_odds, grown_from_streams, grown_steadily, with_quiet_water
 from fluidlift.shape.evidence import fluid_score, gather_evidence
 from fluidlift.shape.segment import OF_SCORE, Label, LabelWriter, clues_of, doubts, overlay, segment, sureness
 from fluidlift.types.clip import VideoClip
@@ -529,6 +529,27 @@ def test_fluid_that_fills_its_picture_grows_over_what_does_not_stream():
     assert all(f is not None for f in found)
     kept, other = (overlap(f, fluid) for f in found)
     assert kept > 0.9 > other
+    steadily = grown_steadily(evidence, everywhere)
+    assert steadily is not None
+    np.testing.assert_array_equal(steadily, found[0])
+
+
+def test_what_has_the_colours_of_all_around_it_does_not_grow_over_that():
+    """A jet of a twentieth of the picture before a wall of its own blue, which gets a little darker to one side."""
+    rng = np.random.default_rng(9)
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
+    jet = (abs(columns - 80) < 8) & (rows < 70)
+    still = np.array([110.0, 140.0, 200.0]) - 0.25 * columns[..., None]
+    pattern = 25.0 * texture(rng, (HEIGHT, WIDTH), sigma=2.0)[..., None]
+    pictures, flow = still_room(rng), no_flow()
+    for t in range(FRAMES):
+        picture = still + np.where(jet[..., None], np.roll(pattern, 2 * t, axis=0), 0.0)
+        pictures[t] = shift(picture, (*rng.normal(scale=0.8, size=2), 0.0), order=1, mode="nearest")
+    flow.displacement[:, jet, 1] = 2.0
+    evidence, everywhere = gather_evidence(clip_of(pictures), flow), np.ones((HEIGHT, WIDTH), bool)
+    lax, steadily = grown_from_streams(evidence, everywhere), grown_steadily(evidence, everywhere)
+    assert lax is not None and steadily is not None
+    assert overlap(steadily, jet) > 0.6 > overlap(lax, jet)
 
 
 def test_what_moves_as_a_solid_is_left_out_where_fluid_grows():

@@ -41,6 +41,10 @@ BEGIN = 0.15
 """of the film, within which a patch begins that follows another one: from half of it on, patches give way so often that
 the same films seem to drift otherwise by 0.5 of their speed; from the start on, all films would repeat themselves"""
 
+LATEST = 0.6
+"""of the film, before which patches begin that follow others which ended all at once, as the first ones do (a choice):
+then places never come back to one instant of the film together"""
+
 SHARPNESS = 8
 """power of the weights: blends of two patterns have less contrast than either, and stay narrow; between places, not in
 time where patches stay"""
@@ -278,20 +282,18 @@ class TexturePatches:
             flow = _gradients(surface, SMOOTH * self._radius)[0] if flow is None else flow
             turns = np.where(at_home, 0.0, _wrapped(self._heading(surface, flow, centers, sources)))
         last, fade = len(self._footage) - 1.0, _fade_of(len(self._footage))
+        ends, full = np.full(n, last - fade), np.ones(n)
         if self._together:
             lasting = self.state.instants[~self.state.going]
             now = float(np.median(lasting)) if len(lasting) else min(self._start, last) if first else self._again
-            full = np.ones(n)
-            return Patches(
-                centers, sources, turns, 0 * full, full if first else full / fade, now * full, (last - fade) * full
-            )
-        if first:
-            begin = np.full(n, min(self._start, last))
-            # as many give way in each frame: where many fall on one, it differs from the next as unrelated ones do
-            ends = begin + (rng.permutation(n) + rng.uniform(0, 1, n)) / n * np.maximum(last - fade - begin, 0.0)
-            return Patches(centers, sources, turns, np.zeros(n), np.ones(n), begin, ends)
-        begin = rng.uniform(0, BEGIN * last, n)
-        return Patches(centers, sources, turns, np.zeros(n), np.full(n, 1 / fade), begin, np.full(n, last - fade))
+            begin, presences = now * full, full if first else full / fade
+        elif first:
+            begin, presences = min(self._start, last) * full, full
+        else:
+            begin, presences = rng.uniform(0, BEGIN * last, n), full / fade
+            if self.state.going.all():  # those that begin at once are not to end at once again
+                begin += rng.permutation(n) / n * (LATEST - BEGIN) * last
+        return Patches(centers, sources, turns, 0 * full, presences, begin, ends)
 
     def _seen_within(self, centers: np.ndarray) -> np.ndarray:
         """Whether anything that was seen is within a radius of places."""

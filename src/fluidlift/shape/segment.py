@@ -24,7 +24,7 @@ from fluidlift.messages import Notice
 from fluidlift.shape.background import in_own_colours
 from fluidlift.shape.carried_layers import by_either, carried_layers
 from fluidlift.shape.change_points import Arrivals, arrivals, bare_before
-from fluidlift.shape.colour_growth import grown_from_streams, still_below_jet, with_quiet_water
+from fluidlift.shape.colour_growth import grown_steadily, still_below_jet, with_quiet_water
 from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence, pair_reader, solids_by_flow
 from fluidlift.shape.frame_pictures import working_size
 from fluidlift.shape.hints import VOICE, Clicks, Point, clicks_at, heed, holes_asked_for
@@ -152,7 +152,7 @@ class Clues:
         """bool [h,w], the fluid grown from its streams, where change does not tell it; else None."""
         if self.horizon is not None or trustworthy(self.score):
             return None
-        return grown_from_streams(self.evidence, self.inside & ~self.solids)
+        return grown_steadily(self.evidence, self.inside & ~self.solids)
 
     @cached_property
     def advances(self) -> bool:

@@ -370,6 +370,17 @@ def test_until_its_film_ends_each_place_shows_the_instant_that_was_filmed():
     assert count > 10 and 0 < max(begun[42:]) < 0.6 * count
 
 
+def test_in_a_loop_as_many_places_go_over_in_each_frame():
+    film = noise_film(36)
+    seen = upright(uniform(0.5))
+    patches = TexturePatches(PictureTexture(AXES, seen, film), 0.6, footage=film, loops=True)
+    patches.advance(seen, 0.0, np.random.default_rng([7, 0]))
+    ends = np.sort(patches.state.ends)
+    assert len(ends) > 10 and (patches.state.instants == 0).all()
+    # one in each of as many equal parts of the film's 35 frames, less the 6 of a fade
+    np.testing.assert_array_equal(np.floor(ends / 29 * len(ends)), np.arange(len(ends)))
+
+
 def drifting_film(count: int, speed: float) -> FluidFootage:
     """Soft grain that moves along rows by so many pixels per frame."""
     grain = ndimage.gaussian_filter(np.random.default_rng(5).normal(size=(128, 300)), 2.0, mode="wrap")

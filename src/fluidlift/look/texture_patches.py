@@ -140,6 +140,8 @@ class TexturePatches:
         together: all patches show the same instant: waves that pass over water that stays are one thing, from shore to
             shore, and so is a jet. At the end of the film all begin anew.
         again: instant of the footage, frames, at which they then begin.
+        loops: as many patches give way in each frame from the first one on, so that the step from a loop's end to its
+            beginning is one as any other. Else the first ones last as long as the film, and go with its clip.
 
     Raises:
         ValueError: a radius that is not positive, or a texture without any usable place.
@@ -155,13 +157,14 @@ class TexturePatches:
         start: float = 0.0,
         together: bool = False,
         again: float = 0.0,
+        loops: bool = False,
     ) -> None:
         require(radius > 0, f"radius {radius}", "positive metres")
         require(texture.usable, "a texture of which nothing was seen")
         self.state = Patches.none()
         self._texture, self._radius = texture, radius
         self._footage, self._edited, self._start = footage, edited, start
-        self._together, self._again = together, again
+        self._together, self._again, self._loops = together, again, loops
         self._good = texture.trust_within(radius)
         self._seen_flow = _gradients(texture.surface, SMOOTH * radius)[0]
 
@@ -289,6 +292,8 @@ class TexturePatches:
             begin, presences = now * full, full if first else full / fade
         elif first:
             begin, presences = min(self._start, last) * full, full
+            if self._loops:
+                ends = begin + (rng.permutation(n) + rng.uniform(0, 1, n)) / n * np.maximum(ends - begin, 0.0)
         else:
             begin, presences = rng.uniform(0, BEGIN * last, n), full / fade
             if self.state.going.all():  # those that begin at once are not to end at once again

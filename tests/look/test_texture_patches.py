@@ -355,7 +355,7 @@ def test_after_the_films_end_other_patches_play():
 
 
 def test_until_its_film_ends_each_place_shows_the_instant_that_was_filmed():
-    """So that what nobody edited goes with the frames of the clip; then places part, and do not end at once again."""
+    """So that it goes with the frames of the clip; then places part, and do not end at once again."""
     film = noise_film(36)
     seen = upright(uniform(0.5))
     patches = TexturePatches(PictureTexture(AXES, seen, film), 0.6, footage=film)
@@ -368,6 +368,20 @@ def test_until_its_film_ends_each_place_shows_the_instant_that_was_filmed():
     count = len(np.unique(patches.state.centers, axis=0))
     assert begun[: len(film) - 8] == [0] * (len(film) - 8) and max(begun[:40]) == count
     assert count > 10 and 0 < max(begun[42:]) < 0.6 * count
+
+
+def test_places_that_end_at_once_do_not_do_so_again_though_one_has_come_later():
+    film = noise_film(36)
+    seen = upright(uniform(0.5))
+    patches = TexturePatches(PictureTexture(AXES, seen, film), 0.6, footage=film)
+    going = []
+    for k in range(80):
+        if k == 15:
+            patches.state = patches.state.select(np.arange(1, len(patches.state)))  # its place is covered anew
+        patches.advance(seen, STEP if k else 0.0, np.random.default_rng([8, k]))
+        going.append(int(patches.state.going.sum()))
+    count = len(np.unique(patches.state.centers, axis=0))
+    assert count > 10 and count - 2 <= max(going[25:40]) < count and max(going[42:]) < 0.6 * count
 
 
 def test_in_a_loop_as_many_places_go_over_in_each_frame():

@@ -42,8 +42,8 @@ BEGIN = 0.15
 the same films seem to drift otherwise by 0.5 of their speed; from the start on, all films would repeat themselves"""
 
 LATEST = 0.6
-"""of the film, before which patches begin that follow others which ended all at once, as the first ones do (a choice):
-then places never come back to one instant of the film together"""
+"""of the film, before which patches begin where all give way at once, as the first ones do (a choice); where a part of
+them does, so much less beyond `BEGIN`. Then they do not end at once again"""
 
 SHARPNESS = 8
 """power of the weights: blends of two patterns have less contrast than either, and stay narrow; between places, not in
@@ -296,8 +296,9 @@ class TexturePatches:
                 ends = begin + (rng.permutation(n) + rng.uniform(0, 1, n)) / n * np.maximum(ends - begin, 0.0)
         else:
             begin, presences = rng.uniform(0, BEGIN * last, n), full / fade
-            if self.state.going.all():  # those that begin at once are not to end at once again
-                begin += rng.permutation(n) / n * (LATEST - BEGIN) * last
+            going = self.state.going
+            if going.any():  # the more begin at once, the farther apart, or they would end at once again
+                begin += rng.permutation(n) / n * going.mean() * (LATEST - BEGIN) * last
         return Patches(centers, sources, turns, 0 * full, presences, begin, ends)
 
     def _seen_within(self, centers: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
-from fluidlift.evaluate import Case, arrays_of_run, evaluate_arrays, read_case
+from fluidlift.evaluate import Case, arrays_of_run, evaluate_arrays, evaluate_asset, read_case
 from fluidlift.evaluate.images import (
     depth_error,
     depth_scale,
@@ -32,6 +32,7 @@ from fluidlift.evaluate.volumes import (
     relative_l2,
     sample_cells,
 )
+from fluidlift.io.asset_folder import save_asset
 from fluidlift.types import (
     CellType,
     Estimate,
@@ -500,3 +501,16 @@ def test_arrays_of_an_asset_of_an_earlier_version_come_from_its_file_and_of_one_
     (tmp_path / "work").mkdir()
     np.savez_compressed(tmp_path / "work" / "evaluation.npz", labels=np.ones((2, 3, 4), np.uint8))
     assert arrays_of_run(tmp_path, {})["labels"].shape == (2, 3, 4)
+
+
+def test_pictures_are_compared_with_the_clip_that_the_asset_was_made_of(tmp_path):
+    # another clip of the same motion than that of the case, which cannot even be read
+    case, folder = write_case(tmp_path / "pool"), tmp_path / "pool.fluid"
+    save_asset(folder, an_asset())
+    (folder / "work").mkdir(exist_ok=True)
+    run = a_run(a_case())
+    stored = folder / "work" / "evaluation.npz"
+    np.savez_compressed(stored, **run)
+    assert evaluate_asset(folder, case)["resimulation.psnr"] is None
+    np.savez_compressed(stored, **run, clip_frames=run["resim_frames"])
+    assert evaluate_asset(folder, case)["resimulation.psnr.fitted"] == 99

@@ -43,6 +43,7 @@ def arrays_of_run(folder: Path, manifest: dict[str, Any]) -> dict[str, np.ndarra
         "resim_flow": shown.flow[:-1],
         "resim_mask": shown.coverage,
         "resim_frames": shown.pictures,
+        "clip_frames": of_clip["read"].clip.frames,
         "first_frame": np.array(g.rest_frame, np.int64),
         "fit_frames": np.array([m.frames[0], m.frames[-1] + 1] if m.frames else [0, 0]),
         "particle_volume": simulation.volume,
@@ -50,4 +51,4 @@ def arrays_of_run(folder: Path, manifest: dict[str, Any]) -> dict[str, np.ndarra
     }
 
 
-_NEEDED = ("flow", "segment", "geometry", "motion")
+_NEEDED = ("read", "flow", "segment", "geometry", "motion")

@@ -73,7 +73,7 @@ def evaluate_arrays(
             truth's. Each may be missing.
         manifest: timings and peak memory.
         case: the truth.
-        video: u8 [T,H,W,3], the clip of the case on the raster of resim_frames.
+        video: u8 [T,H,W,3], the clip that the asset was made of on the raster of resim_frames.
     """
     segmentation, series = score_segmentation(arrays, case)
     flow = score_flow(arrays, case)
@@ -125,8 +125,9 @@ def evaluate_asset(folder: Path, truth: Path) -> Evaluation:
     manifest = read_json(folder / "manifest.json")
     arrays = arrays_of_run(folder, manifest)
     frames, _ = picked(arrays, "resim_frames", 4, 3)
-    video = None
-    if frames is not None:
+    # the asset may be of another clip of the same motion than that of the case
+    video, _ = picked(arrays, "clip_frames", 4, 3)
+    if frames is not None and video is None:
         try:
             video = read_video(case.video, (frames.shape[2], frames.shape[1]))
         except FluidliftError:

@@ -13,6 +13,7 @@ raised to damp them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,20 +115,35 @@ def profile(
         budget: counts the work.
         iterations: of the conjugate gradients; eigenvalues lie between 1 and about one plus the number of frames.
     """
-    n = len(problem.windows)
-    found = budget.each(
-        problem, lambda i: _window_profile(problem, space, here.raw, i, slopes.columns[i], iterations), list(range(n))
-    )
+    n, workers = len(problem.windows), 1 if problem.placed else budget.workers
+    # as many equal parts of windows as keep all workers busy to the end
+    parts = [
+        (i, part)
+        for i, columns in enumerate(slopes.columns)
+        for part in np.array_split(np.flatnonzero(columns.any(axis=1)), workers // math.gcd(n, workers))
+        if len(part)
+    ]
+    columns = [
+        np.concatenate([c, np.zeros((len(c), w.start.numel()), np.float32)], axis=1)
+        for c, w in zip(slopes.columns, problem.windows)
+    ]
+    moves = [np.zeros((len(c), w.start.numel()), np.float32) for c, w in zip(slopes.columns, problem.windows)]
+
+    def one(index: int, part: np.ndarray) -> None:
+        columns[index][part], moves[index][part] = _along_best_start(
+            problem, space, here.raw, index, slopes.columns[index][part], iterations
+        )
+
+    budget.each(problem, one, *zip(*parts))
     budget.count(problem, len(here.raw) * iterations * (1 + BACKWARD))
-    columns, moves = [f[0] for f in found], [f[1] for f in found]
     together = [np.concatenate([r.ravel(), s]) for r, s in zip(here.residuals, start_residuals(problem))]
     return Profile(Jacobian(columns, *products(columns, together)), moves)
 
 
-def _window_profile(
+def _along_best_start(
     problem: FitProblem, space: ParameterSpace, raw: np.ndarray, index: int, columns: np.ndarray, iterations: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """[p, n + f] columns along the best start and [p, f] how it moves."""
+    """[p, n + f] columns of a window, none of them zero, along its best start, and [p, f] how that moves."""
     parameters = space.physical(torch.as_tensor(raw, dtype=torch.float32))
     start = problem.windows[index].start.clone().requires_grad_()
     run = problem.roll(index, parameters, start=start)
@@ -156,10 +172,6 @@ def _window_profile(
     for column in columns:
         target = torch.from_numpy(column)
         move, image = torch.zeros_like(weight), torch.zeros_like(at)
-        if not column.any():
-            out.append(torch.cat([target, move]).numpy())
-            moves.append(move.numpy())
-            continue
         rest = -adjoint(target)
         eased = rest / scale
         direction, power = eased.clone(), float((rest * eased).sum())

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from fluidlift.physics.inflow_schedule import InletPath
+from fluidlift.scene.surface_film import LATER
 from fluidlift.types import CellType, Grid, PinholeCamera, kind_of
 
 if TYPE_CHECKING:
@@ -116,8 +117,6 @@ def inlet_path(scene: Scene) -> InletPath | None:
         return None
     frames, again = len(scene.inlet), 0.0
     if scene.dry is not None and math.isfinite(scene.dry_for):  # as `SurfaceAppearance` has it
-        from fluidlift.scene.surface_appearance import LATER
-
         again = LATER * frames
     pace = scene.interval / scene.clip_interval
     instants = instants_together(frames, start=scene.film_start, again=again, pace=pace, count=scene.simulated)

@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
-from functools import lru_cache
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
@@ -18,7 +16,8 @@ import numpy as np
 from fluidlift.errors import InputRejected
 from fluidlift.messages import Notice
 from fluidlift.scene.simulator import lends_look
-from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, kind_of, sh_from_rgb
+from fluidlift.scene.surface_film import FINE, LATER, surface_film
+from fluidlift.types import Gaussians, Particles, concatenate, kind_of, sh_from_rgb
 from fluidlift.types.rows import rows
 
 if TYPE_CHECKING:
@@ -53,10 +52,6 @@ AT_HOME = 0.6
 meet, the motion of the film breaks off. Of 0.12, 0.3 and 0.6 a fall's current is off by 0.65, 0.46 and 0.44 (after its
 clip 0.64, 0.50 and 0.35)"""
 
-LATER = 0.5
-"""share of a film from which it begins anew where its fluid grew (a vessel that fills): the later half is
-nearer to where the fluid is then"""
-
 FEWEST_CELLS = 4.0
 """radius of a patch at least, cells"""
 
@@ -82,23 +77,6 @@ BEHIND_WALL = 0.5
 
 CLEAR = 0.1
 """cells from the ground within which the skin is left out"""
-
-LOOKED_UP = 1 / 6 + 0.3
-"""variance (px^2) of the blur between a film and its splats' picture beside that of the splats: a bilinear look-up
-(a triangle of one pixel to each side, 1/6), and what the rasteriser adds to each splat"""
-
-AS_AT_REST = "its surface looks as it did at rest"
-"""what follows where there is no film to play"""
-
-FINE, FINER = 1.7, 1.2
-"""px of the film between tracers of a skin that plays it, at most; and where its grain is too fine for that. Of 1.7,
-1.2 and 0.85 (a level each) a fountain's finest band has 0.70, 0.83 and 0.88 of the clip's, sharpening included, and its
-current is off by 0.52, 0.43 and 0.39; frames are larger by a fifth from each to the next"""
-
-GRAIN = 0.55
-"""of the amplitude of a film's finest band that splats `FINE` apart show, below which they lie closer. A fountain and a
-shallow river, which gain by it, have 0.45 and 0.28; calm rivers, a sea and corn that boils, which are as before, 0.50
-to 0.52; a torrent, a sunset and the demo, whose frames only get larger, or too crisp, 0.62 to 0.68"""
 
 SMALLEST = 0.02
 """standard deviation of a splat at least, cells: files hold its logarithm"""
@@ -148,51 +126,6 @@ class UnderSkin(NamedTuple):
     """whether the wall of a vessel does"""
     filmed: np.ndarray | None
     """m to the outline of the film; None: there is none"""
-
-
-def _footage(
-    film: Path, camera: PinholeCamera, means: np.ndarray, cell: float
-) -> tuple[FluidFootage, float] | str:  # fmt: skip
-    """The film of an asset, taken apart, and how far apart (px of it) are what shows it; or what is wrong with it.
-
-    Args:
-        film: its file.
-        camera: that took it.
-        means: of the body's Gaussians, m.
-        cell: width of the simulator's cells, m.
-    """
-    from fluidlift.io.footage_file import size_of_film
-    from fluidlift.look.surface_skin import PITCH, WIDTH, finer, level_for
-
-    if not film.is_file():
-        return f"is missing: {AS_AT_REST}; make the asset again"
-    small = camera.resized(size_of_film(camera.size))
-    coarse = PITCH * cell * small.focal[0] / np.maximum(small.project(means)[1], 1e-6)
-    apart = [float(np.median(coarse * finer(level_for(coarse, wanted)))) for wanted in (FINE, FINER)]
-    usual, closer = (float(np.sqrt((WIDTH * a) ** 2 + LOOKED_UP)) for a in apart)
-    written = film.stat()
-    found = _taken_apart(film, camera.size, (usual, closer), (written.st_mtime_ns, written.st_size))
-    return found if isinstance(found, str) else (found[0], FINER if found[1] else FINE)
-
-
-@lru_cache(maxsize=1)
-def _taken_apart(
-    film: Path, size: tuple[int, int], blurs: tuple[float, float], written: tuple[int, int]
-) -> tuple[FluidFootage, bool] | str:
-    """As `_footage`, of a file as it was `written`, and whether the second, smaller of two blurs was taken. The last
-    one is kept: it takes a second or two, and a live preview begins anew with every edit."""
-    from fluidlift.io.footage_file import read_footage
-    from fluidlift.look.footage import FEWEST, FluidFootage, grain_kept
-
-    try:
-        frames, fluid, interval = read_footage(film, size)
-    except InputRejected as error:
-        return f"is damaged ({error.got}): {AS_AT_REST}; make the asset again"
-    if len(frames) < FEWEST:
-        return f"has {len(frames)} frames and needs {FEWEST}: {AS_AT_REST}; make the asset from a longer clip"
-    closer = grain_kept(frames, fluid, blurs[0]) < GRAIN
-    found = FluidFootage.of(frames, fluid, interval, blur=blurs[closer])
-    return f"shows none: {AS_AT_REST}; make the asset again" if found is None else (found, closer)
 
 
 def levelled(surface: SurfaceMap, level: float, within: float) -> SurfaceMap:
@@ -338,7 +271,7 @@ class SurfaceAppearance:
         scene = self._scene
         if scene.film is None:
             return None
-        found = _footage(scene.film, scene.camera, own.means, self._cell)
+        found = surface_film(scene.film, scene.camera, own.means, self._cell)
         if isinstance(found, str):
             self._missing = (Notice("film-not-played", f"the film of the fluid {found}"),)
             return None

@@ -12,7 +12,7 @@ from fluidlift.look.footage import FluidFootage
 from fluidlift.look.picture_texture import PictureTexture
 from fluidlift.look.seen_texture import SeenTexture
 from fluidlift.look.surface_axes import PictureAxes
-from fluidlift.look.surface_map import SurfaceMap
+from fluidlift.look.surface_map import SurfaceMap, sampled
 from fluidlift.look.texture_patches import FASTEST, LIMIT, Patches, TexturePatches, instants_together
 from fluidlift.types import Gaussians, PinholeCamera
 
@@ -287,11 +287,11 @@ def test_pairs_at_home_are_those_that_are_looked_up_like_any_other(seen_in):
     if seen_in == "plan":
         where = surface(uniform(0.5))
         patches = TexturePatches(SeenTexture(sheet(), CAMERA, where), 0.6, footage=FILM, start=40.0)
-        for k, interval in enumerate([0.0, *[STEP] * 12]):  # into the fade at the film's end
+        for k, interval in enumerate([0.0, *[STEP] * 40]):  # the first ones have gone at the film's end
             patches.advance(where, interval, np.random.default_rng(k))
         points = CAMERA.unproject(pixels()[1][:, ::-1] + 0.5, np.full(len(pixels()[1]), 9.4))
     else:
-        patches, points = played(12, start=40.0), pixels()[0]
+        patches, points = played(40, start=40.0), pixels()[0]
     fast = patches.colors(points)
     s = patches.state
     assert len(np.unique(s.instants)) > 3 and (s.sources == s.centers).all()
@@ -339,7 +339,7 @@ def test_liveliness_is_the_same_wherever_and_whenever_one_looks():
 
 
 def test_after_the_films_end_other_patches_play():
-    """None is left of the first ones, none shows a last frame that stands still, and nothing is bare."""
+    """The first ones go after its last frame, no other ever comes to it, and nothing is bare."""
     film = noise_film(24)
     last, points = len(film) - 1, pixels()[0]
     seen = upright(uniform(0.5))
@@ -349,7 +349,9 @@ def test_after_the_films_end_other_patches_play():
         patches.advance(seen, STEP if k else 0.0, np.random.default_rng([5, k]))
         latest.append(patches.state.instants.max())
         assert patches.colors(points)[1].all()
-    assert max(latest) <= last
+        if k <= last:
+            np.testing.assert_allclose(patches.state.presences, 1.0)
+    assert max(latest) == last + 3 and max(latest[last + 4 :]) <= last  # gone within a fade, a sixth of the film
     assert np.ptp(patches.state.instants) > 0.3 * last, "of many instants, where the first ones were of one"
     assert (patches.state.instants < 60).all()
 
@@ -362,11 +364,11 @@ def test_until_its_film_ends_each_place_shows_the_instant_that_was_filmed():
     begun = []
     for k in range(80):
         patches.advance(seen, STEP if k else 0.0, np.random.default_rng([7, k]))
-        if k < len(film) - 1 - 6:  # frames of a fade
+        if k < len(film):
             np.testing.assert_allclose(patches.state.instants, k, atol=1e-9)
         begun.append(int((patches.state.presences < 1.1 / 6).sum()))
     count = len(np.unique(patches.state.centers, axis=0))
-    assert begun[: len(film) - 8] == [0] * (len(film) - 8) and max(begun[:40]) == count
+    assert begun[: len(film)] == [0] * len(film) and begun[len(film)] == count
     assert count > 10 and 0 < max(begun[42:]) < 0.6 * count
 
 
@@ -387,7 +389,7 @@ def test_places_that_end_at_once_do_not_do_so_again_though_one_has_come_later():
 def test_in_a_loop_as_many_places_go_over_in_each_frame():
     film = noise_film(36)
     seen = upright(uniform(0.5))
-    patches = TexturePatches(PictureTexture(AXES, seen, film), 0.6, footage=film, loops=True)
+    patches = TexturePatches(PictureTexture(AXES, seen, film), 0.6, footage=film, first_end="apart")
     patches.advance(seen, 0.0, np.random.default_rng([7, 0]))
     ends = np.sort(patches.state.ends)
     assert len(ends) > 10 and (patches.state.instants == 0).all()
@@ -403,6 +405,23 @@ def drifting_film(count: int, speed: float) -> FluidFootage:
     film = FluidFootage.of(np.repeat(frames[..., None], 3, axis=-1), np.ones(frames.shape, bool), STEP)
     assert film is not None
     return film
+
+
+def test_the_last_frame_of_a_film_is_carried_on_until_other_patches_have_come():
+    """What leaves with a still picture would be seen to stop: a film whose grain moves as its surface does."""
+    seen, (points, index) = upright(uniform(0.5)), pixels(40)
+    speed = 0.5 * STEP * CAMERA.focal[0] / 9.5  # px per frame
+    film = drifting_film(24, speed)
+    patches = TexturePatches(PictureTexture(AXES, seen, film), 0.6, footage=film)
+    for k in range(len(film) + 2):
+        patches.advance(seen, STEP if k else 0.0, np.random.default_rng([9, k]))
+    gone = patches.state.instants > len(film) - 0.5
+    patches.state = patches.state.select(gone)  # the pictures of those alone that go
+    assert gone.any() and not gone.all()
+    shown = patches.colors(points)[0][:, 0]
+    after = sampled(drifting_film(len(film) + 2, speed).frames[-1] / 255.0, index.astype(float))[:, 0]
+    still = sampled(film.frames[-1] / 255.0, index.astype(float))[:, 0]
+    assert np.abs(shown - after).mean() < 0.25 * np.abs(still - after).mean()
 
 
 def test_where_a_film_goes_over_into_itself_slow_water_seems_to_move_as_it_was_filmed():
@@ -511,7 +530,7 @@ def test_a_level_surface_seen_from_flat_above_lends_its_look():
 def test_patches_of_a_sea_show_one_instant_and_begin_again_together():
     where, rng = surface(lambda x, y: (0.0 * x, 0.0 * y)), np.random.default_rng(0)
     texture = SeenTexture(sheet(), CAMERA, where)
-    sea = TexturePatches(texture, 0.6, footage=FILM, start=40.0, together=True)
+    sea = TexturePatches(texture, 0.6, footage=FILM, start=40.0, together=True, first_end="faded")
     ended, before = 0, 0.0
     for frame in range(20):
         sea.advance(where, STEP if frame else 0.0, rng)

@@ -10,6 +10,7 @@ time.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num
@@ -40,6 +41,10 @@ seem to drift otherwise by 0.25 of it, of 1/6 by 0.22, of 1/9, where they pop, b
 BEGIN = 0.15
 """of the film, within which a patch begins that follows another one: from half of it on, patches give way so often that
 the same films seem to drift otherwise by 0.5 of their speed; from the start on, all films would repeat themselves"""
+
+AFTER = 0.5
+"""frames after the film's last one at which patches that show all of it give way: with the next frame, however instants
+are rounded"""
 
 LATEST = 0.6
 """of the film, before which patches begin where all give way at once, as the first ones do (a choice); where a part of
@@ -140,8 +145,10 @@ class TexturePatches:
         together: all patches show the same instant: waves that pass over water that stays are one thing, from shore to
             shore, and so is a jet. At the end of the film all begin anew.
         again: instant of the footage, frames, at which they then begin.
-        loops: as many patches give way in each frame from the first one on, so that the step from a loop's end to its
-            beginning is one as any other. Else the first ones last as long as the film, and go with its clip.
+        first_end: how the first ones give way. "carried": after the film's last frame, which the current carries on
+            while they go (where nothing was edited); "faded": before it, as later ones do (waves leave the water where
+            it is, and nothing carries them on); "apart": as many in each frame from the first one on, so that the step
+            from a loop's end to its beginning is one as any other.
 
     Raises:
         ValueError: a radius that is not positive, or a texture without any usable place.
@@ -157,14 +164,14 @@ class TexturePatches:
         start: float = 0.0,
         together: bool = False,
         again: float = 0.0,
-        loops: bool = False,
+        first_end: Literal["carried", "faded", "apart"] = "carried",
     ) -> None:
         require(radius > 0, f"radius {radius}", "positive metres")
         require(texture.usable, "a texture of which nothing was seen")
         self.state = Patches.none()
         self._texture, self._radius = texture, radius
         self._footage, self._edited, self._start = footage, edited, start
-        self._together, self._again, self._loops = together, again, loops
+        self._together, self._again, self._first_end = together, again, first_end
         self._good = texture.trust_within(radius)
         self._seen_flow = _gradients(texture.surface, SMOOTH * radius)[0]
 
@@ -211,15 +218,20 @@ class TexturePatches:
         if self._stays and self._footage is not None:  # nothing is carried: how the surface moves need not be known
             rate, centers, turns = np.zeros(len(s)), s.centers, s.turns
             instants = s.instants + interval / self._footage.interval
+            # what the last frame of a film shows is carried on as the fluid was when it was filmed
+            over = instants > len(self._footage) - 1 + AFTER
+            sources = s.sources.copy()
+            sources[over] -= interval * self._texture.surface.at(self._seen_flow, centers[over])
         else:
             rate, centers, turns, instants = self._with_the_flow(surface, interval)
+            sources = s.sources
         strains = s.strains + interval * rate
         fade = np.clip(LIMIT / 3 / np.maximum(rate * interval, 1e-9), *FADE)
         if self._footage is not None:  # those that go must be gone by the film's last frame
             fade = np.clip(_fade_of(len(self._footage)) / np.maximum(instants - s.instants, 1e-9), 1.0, fade)
         going = (strains > LIMIT) | (instants >= s.ends)
         presences = np.clip(s.presences + np.where(going, -1, 1) / fade, 0.0, 1.0)
-        new = Patches(centers, s.sources, turns, strains, presences, instants, s.ends)
+        new = Patches(centers, sources, turns, strains, presences, instants, s.ends)
         away = nearest_of_few(surface.columns(), centers, 1)[0][:, 0]  # without any, endlessly far
         self.state = new.select(~(new.going & (presences <= 0)) & (away < self._radius))
 
@@ -286,13 +298,15 @@ class TexturePatches:
             turns = np.where(at_home, 0.0, _wrapped(self._heading(surface, flow, centers, sources)))
         last, fade = len(self._footage) - 1.0, _fade_of(len(self._footage))
         ends, full = np.full(n, last - fade), np.ones(n)
+        if first and self._stays and self._first_end == "carried":
+            ends += fade + AFTER
         if self._together:
             lasting = self.state.instants[~self.state.going]
             now = float(np.median(lasting)) if len(lasting) else min(self._start, last) if first else self._again
             begin, presences = now * full, full if first else full / fade
         elif first:
             begin, presences = min(self._start, last) * full, full
-            if self._loops:
+            if self._first_end == "apart":
                 ends = begin + (rng.permutation(n) + rng.uniform(0, 1, n)) / n * np.maximum(ends - begin, 0.0)
         else:
             begin, presences = rng.uniform(0, BEGIN * last, n), full / fade
@@ -432,7 +446,7 @@ def _fade_of(frames: int) -> float:
 
 
 def instants_together(frames: int, *, start: float, again: float, pace: float, count: int) -> Float[np.ndarray, " n"]:
-    """Instant of a film that is most present in each frame of a scene where all patches show the same one.
+    """Instant of a film that is most present in each frame of a scene where all patches show the same one, and run.
 
     Args:
         frames: of the film.
@@ -442,15 +456,15 @@ def instants_together(frames: int, *, start: float, again: float, pace: float, c
         count: frames of the scene.
     """
     last, fade = frames - 1.0, _fade_of(frames)
-    found, now, following = np.empty(count), min(start, last), None
+    found, now, end, following = np.empty(count), min(start, last), last + AFTER, None
     for frame in range(count):
-        found[frame] = now
-        now = min(now + pace, last)
+        found[frame] = min(now, last)
+        now += pace
         following = None if following is None else following + pace
-        if following is None and now >= last - fade:
+        if following is None and now >= end:
             following = again
         if following is not None and following - again >= 0.5 * fade:  # it has come in by as much as the other is gone
-            now, following = following, None
+            now, end, following = following, last - fade, None
     return found
 
 

@@ -230,7 +230,8 @@ class SurfaceAppearance:
         self._patches = TexturePatches(
             texture, max(radius * across, FEWEST_CELLS * self._cell), footage=footage,
             edited=scene.edited and not stands, start=scene.film_start, together=stands or pours,
-            again=LATER * len(footage) if grows and footage is not None else 0.0, loops=scene.overlap > 0,
+            again=LATER * len(footage) if grows and footage is not None else 0.0,
+            first_end="apart" if scene.overlap > 0 else "faded" if stands else "carried",
         )  # fmt: skip
         if footage is not None and stands and not scene.edited:
             self._level = float(np.median(surface.height[surface.wet]))

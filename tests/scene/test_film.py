@@ -17,7 +17,8 @@ from fluidlift.look.surface_skin import WIDTH
 from fluidlift.pipeline.preview import preview_scene
 from fluidlift.scene.build import SimulationRequest, film_of, first_of_film, scene_of
 from fluidlift.scene.simulator import simulator_of
-from fluidlift.scene.surface_appearance import DROP, FINE, FINER, SurfaceAppearance
+from fluidlift.scene.surface_appearance import DROP, SurfaceAppearance
+from fluidlift.scene.surface_film import FINE, FINER
 from fluidlift.types import PinholeCamera
 
 FRAMES = 4
@@ -272,7 +273,7 @@ def test_a_fall_without_its_film_is_told_as_well(channel, tmp_path):
 
 def test_a_film_is_taken_apart_once_and_again_when_it_has_changed(channel, tmp_path):
     """A live preview begins anew with every edit."""
-    from fluidlift.scene.surface_appearance import _taken_apart
+    from fluidlift.scene.surface_film import _taken_apart
 
     path = film(tmp_path / "film.mp4")
     scene, before = channel(FRAMES, film=path), _taken_apart.cache_info()

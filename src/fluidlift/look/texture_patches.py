@@ -227,7 +227,7 @@ class TexturePatches:
             sources = s.sources
         strains = s.strains + interval * rate
         fade = np.clip(LIMIT / 3 / np.maximum(rate * interval, 1e-9), *FADE)
-        if self._footage is not None:  # those that go must be gone by the film's last frame
+        if self._footage is not None:  # later ones must be gone by the film's last frame
             fade = np.clip(_fade_of(len(self._footage)) / np.maximum(instants - s.instants, 1e-9), 1.0, fade)
         going = (strains > LIMIT) | (instants >= s.ends)
         presences = np.clip(s.presences + np.where(going, -1, 1) / fade, 0.0, 1.0)

@@ -272,6 +272,8 @@ def test_of_several_obstacles_the_chosen_one_has_the_gizmo_and_the_controls(visi
     for name in ("sphere1", "sphere2"):
         visit.press("Add to the scene")
         visit.until(lambda name=name: viewer.chosen == name, name)
+        # the page hears of it later: a choice before that is lost with the list that it was made in
+        visit.until(lambda name=name: visit.field("chosen").input_value() == name, f"{name} on the page")
     first, second = viewer.draft.obstacles
     apart = np.linalg.norm(np.subtract(first["position"], second["position"]))
     assert apart > 2 * first["radius"]  # not one inside the other

@@ -541,15 +541,17 @@ def test_patches_of_a_sea_show_one_instant_and_begin_again_together():
     assert ended == 1 and before == 10.0, "after nine frames from the first one on"
 
 
+@pytest.mark.parametrize("first_end", ["carried", "faded", "apart"])
 @pytest.mark.parametrize(("again", "interval"), [(0.0, STEP), (0.5 * len(FILM), STEP), (0.0, 1.6 * STEP)])
-def test_the_instant_that_all_of_them_show_is_known_beforehand(again, interval):
+def test_the_instant_that_all_of_them_show_is_known_beforehand(again, interval, first_end):
     ground, rng = upright(uniform(0.0)), np.random.default_rng(0)
-    jet = TexturePatches(PictureTexture(AXES, ground, FILM), 0.6, footage=FILM, start=40.0, together=True, again=again)
+    known = {"start": 40.0, "again": again, "first_end": first_end}
+    jet = TexturePatches(PictureTexture(AXES, ground, FILM), 0.6, footage=FILM, together=True, **known)
     shown = []
     for k in range(3 * len(FILM)):
         jet.advance(ground, interval if k else 0.0, rng)
         shown.append(jet.leading)
     pace = interval / FILM.interval
-    expected = instants_together(len(FILM), start=40.0, again=again, pace=pace, count=len(shown))
+    expected = instants_together(len(FILM), pace=pace, count=len(shown), **known)
     apart = np.abs(np.array(shown) - expected)
     assert np.median(apart) < 0.01 and (apart > 2.0 * pace).mean() < 0.05

@@ -79,6 +79,9 @@ SAME = 0.25
 GOOD = 0.8
 """share of a source that was seen, from which it is taken at once"""
 
+FirstEnd = Literal["carried", "faded", "apart"]
+"""how the first patches of a film give way (`TexturePatches`)"""
+
 
 @dataclass
 class Patches:
@@ -164,7 +167,7 @@ class TexturePatches:
         start: float = 0.0,
         together: bool = False,
         again: float = 0.0,
-        first_end: Literal["carried", "faded", "apart"] = "carried",
+        first_end: FirstEnd = "carried",
     ) -> None:
         require(radius > 0, f"radius {radius}", "positive metres")
         require(texture.usable, "a texture of which nothing was seen")
@@ -445,8 +448,10 @@ def _fade_of(frames: int) -> float:
     return min(FADE[1], FILM_FADE * frames)
 
 
-def instants_together(frames: int, *, start: float, again: float, pace: float, count: int) -> Float[np.ndarray, " n"]:
-    """Instant of a film that is most present in each frame of a scene where all patches show the same one, and run.
+def instants_together(
+    frames: int, *, start: float, again: float, pace: float, count: int, first_end: FirstEnd = "carried"
+) -> Float[np.ndarray, " n"]:
+    """Instant of a film that is most present in each frame of a scene where all patches show the same one.
 
     Args:
         frames: of the film.
@@ -454,9 +459,11 @@ def instants_together(frames: int, *, start: float, again: float, pace: float, c
         again: at which it begins anew.
         pace: frames of the film per frame of the scene.
         count: frames of the scene.
+        first_end: as of `TexturePatches`.
     """
     last, fade = frames - 1.0, _fade_of(frames)
-    found, now, end, following = np.empty(count), min(start, last), last + AFTER, None
+    found, now, following = np.empty(count), min(start, last), None
+    end = last + AFTER if first_end == "carried" else last - fade
     for frame in range(count):
         found[frame] = min(now, last)
         now += pace

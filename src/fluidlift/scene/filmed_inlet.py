@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from fluidlift.physics.inflow_schedule import InletPath
-from fluidlift.scene.surface_film import LATER
+from fluidlift.scene.surface_film import LATER, first_end
 from fluidlift.types import CellType, Grid, PinholeCamera, kind_of
 
 if TYPE_CHECKING:
@@ -119,7 +119,9 @@ def inlet_path(scene: Scene) -> InletPath | None:
     if scene.dry is not None and math.isfinite(scene.dry_for):  # as `SurfaceAppearance` has it
         again = LATER * frames
     pace = scene.interval / scene.clip_interval
-    instants = instants_together(frames, start=scene.film_start, again=again, pace=pace, count=scene.simulated)
+    instants = instants_together(
+        frames, start=scene.film_start, again=again, pace=pace, count=scene.simulated, first_end=first_end(scene)
+    )
     cells = _stepped(scene.inlet[np.rint(instants).astype(int)] / scene.terrain.grid.spacing)
     moved = np.flatnonzero(np.r_[True, (np.diff(cells, axis=0) != 0).any(axis=1)])
     return InletPath(scene.interval * moved, cells[moved])

@@ -16,7 +16,7 @@ import numpy as np
 from fluidlift.errors import InputRejected
 from fluidlift.messages import Notice
 from fluidlift.scene.simulator import lends_look
-from fluidlift.scene.surface_film import FINE, LATER, surface_film
+from fluidlift.scene.surface_film import FINE, LATER, first_end, surface_film
 from fluidlift.types import Gaussians, Particles, concatenate, kind_of, sh_from_rgb
 from fluidlift.types.rows import rows
 
@@ -231,7 +231,7 @@ class SurfaceAppearance:
             texture, max(radius * across, FEWEST_CELLS * self._cell), footage=footage,
             edited=scene.edited and not stands, start=scene.film_start, together=stands or pours,
             again=LATER * len(footage) if grows and footage is not None else 0.0,
-            first_end="apart" if scene.overlap > 0 else "faded" if stands else "carried",
+            first_end=first_end(scene),
         )  # fmt: skip
         if footage is not None and stands and not scene.edited:
             self._level = float(np.median(surface.height[surface.wet]))

@@ -10,10 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import InputRejected
-from fluidlift.types import PinholeCamera
+from fluidlift.types import PinholeCamera, kind_of
 
 if TYPE_CHECKING:
     from fluidlift.look.footage import FluidFootage
+    from fluidlift.look.texture_patches import FirstEnd
+    from fluidlift.scene.build import Scene
 
 LATER = 0.5
 """share of a film from which it begins anew where its fluid grew (a vessel that fills): the later half is
@@ -35,6 +37,13 @@ GRAIN = 0.55
 """of the amplitude of a film's finest band that splats `FINE` apart show, below which they lie closer. A fountain and a
 shallow river, which gain by it, have 0.45 and 0.28; calm rivers, a sea and corn that boils, which are as before, 0.50
 to 0.52; a torrent, a sunset and the demo, whose frames only get larger, or too crisp, 0.62 to 0.68"""
+
+
+def first_end(scene: Scene) -> FirstEnd:
+    """How the pieces with which the film of a scene begins give way to others."""
+    if scene.overlap > 0:
+        return "apart"
+    return "faded" if kind_of(scene.kind).is_still_water else "carried"
 
 
 def surface_film(

@@ -134,7 +134,7 @@ def test_a_film_that_is_too_short_or_shows_no_fluid_is_none():
 def test_what_was_sharpened_comes_out_of_the_splats_blur_as_it_was():
     """Grain that is hardly wider than the blur: of what it takes, a part of a part of a part is lost (see below)."""
     blur, frames = 0.9, lively(sigma=1.2)
-    film = FluidFootage.of(frames, everywhere(), INTERVAL, blur=blur)
+    film = FluidFootage.of(frames, everywhere(), INTERVAL, blur=(blur, blur))
 
     def error(pictures: np.ndarray) -> float:
         shown = np.stack([cv2.GaussianBlur(p.astype(np.float32), (0, 0), blur) for p in pictures])
@@ -156,10 +156,25 @@ def test_a_wave_of_which_the_blur_leaves_g_comes_out_with_all_but_the_power_of_w
         return float(2 * np.abs((row * np.exp(2j * np.pi * x[2:62] / wavelength)).mean()))
 
     left = amplitude(frames[0]) / 40
-    shown = amplitude(FluidFootage.of(frames, everywhere(), INTERVAL, blur=blur).frames[0]) / 40
+    shown = amplitude(FluidFootage.of(frames, everywhere(), INTERVAL, blur=(blur, blur)).frames[0]) / 40
     # rounding to whole levels twice: half a level of forty, and its mean over sixty pixels much less
     assert shown == pytest.approx(1 - (1 - left) ** (SHARPER + 1), abs=0.5 / 40)
     assert left < 0.9, "or the blur takes nothing"
+
+
+def test_what_is_blurred_less_down_the_picture_is_sharpened_less_there():
+    """Splats of a surface that is seen along it are flat in the picture."""
+    blur, frames = (1.1, 0.6), lively(sigma=0.8)
+    sharp = FluidFootage.of(frames, everywhere(), INTERVAL, blur=blur).frames
+
+    def steps(pictures: np.ndarray, axis: int) -> float:
+        return float(np.square(np.diff(pictures[:, 6:-6, 6:-6].astype(float), axis=axis)).mean())
+
+    across, down = (steps(sharp, axis) / steps(frames, axis) for axis in (2, 1))
+    assert across > 1.4 * down > 1.4
+    shown = np.stack([cv2.GaussianBlur(p.astype(np.float32), (0, 0), sigmaX=1.1, sigmaY=0.6) for p in sharp])
+    across, down = (steps(shown, axis) / steps(frames, axis) for axis in (2, 1))
+    assert across == pytest.approx(down, abs=0.35), "and comes out alike, as far as it does"
 
 
 def test_sharpening_takes_nothing_from_beside_the_fluid():
@@ -167,7 +182,7 @@ def test_sharpening_takes_nothing_from_beside_the_fluid():
     fluid = everywhere()
     fluid[:, :, 32:] = False
     frames = np.where(fluid[..., None], WATER, 255).astype(np.uint8)
-    film = FluidFootage.of(frames, fluid, INTERVAL, blur=1.2)
+    film = FluidFootage.of(frames, fluid, INTERVAL, blur=(1.2, 1.2))
     np.testing.assert_array_equal(film.frames, frames)
 
 
@@ -227,20 +242,20 @@ def test_beyond_the_sides_of_the_picture_lies_its_mirror_image():
 
 def test_less_is_kept_of_finer_grain_and_by_wider_splats():
     fine, coarse = lively(sigma=0.4), lively(sigma=2.0)
-    kept = [[grain_kept(film, everywhere(), blur) for blur in (0.6, 0.9, 1.2)] for film in (fine, coarse)]
+    kept = [[grain_kept(film, everywhere(), (blur, blur)) for blur in (0.6, 0.9, 1.2)] for film in (fine, coarse)]
     assert (np.diff(kept, axis=1) < 0).all() and (np.array(kept[1]) > np.array(kept[0])).all()
     assert kept[0][2] < 0.5 and kept[1][0] > 0.9
     still = np.full((FRAMES, *SIZE, 3), 90, np.uint8)
-    assert grain_kept(still, everywhere(), 1.0) == 1.0 and grain_kept(fine, ~everywhere(), 1.0) == 1.0
+    assert grain_kept(still, everywhere(), (1.0, 1.0)) == 1.0 and grain_kept(fine, ~everywhere(), (1.0, 1.0)) == 1.0
 
 
 def test_what_is_kept_is_what_the_film_then_shows():
     """Against the picture of it: sharpened, and blurred as splats do."""
     frames, blur = lively(sigma=0.7), 1.0
-    found = FluidFootage.of(frames, everywhere(), INTERVAL, blur=blur)
+    found = FluidFootage.of(frames, everywhere(), INTERVAL, blur=(blur, blur))
     assert found is not None
     own, shown = (
         [np.std(g - cv2.GaussianBlur(g, (0, 0), 1.0)) for g in film.astype(np.float32).mean(axis=-1)]
         for film in (frames, np.stack([cv2.GaussianBlur(f.astype(np.float32), (0, 0), blur) for f in found.frames]))
     )
-    assert grain_kept(frames, everywhere(), blur) == pytest.approx(np.mean(shown) / np.mean(own), rel=0.05)
+    assert grain_kept(frames, everywhere(), (blur, blur)) == pytest.approx(np.mean(shown) / np.mean(own), rel=0.05)

@@ -18,7 +18,7 @@ from fluidlift.pipeline.preview import preview_scene
 from fluidlift.scene.build import SimulationRequest, film_of, first_of_film, scene_of
 from fluidlift.scene.simulator import simulator_of
 from fluidlift.scene.surface_appearance import DROP, SurfaceAppearance
-from fluidlift.scene.surface_film import FINE, FINER
+from fluidlift.scene.surface_film import FINE, FINER, foreshortening
 from fluidlift.types import PinholeCamera
 
 FRAMES = 4
@@ -283,6 +283,22 @@ def test_a_film_is_taken_apart_once_and_again_when_it_has_changed(channel, tmp_p
     assert after.misses == before.misses + 1 and after.hits == before.hits + 1
     path.write_bytes(b"something else")
     assert CONSEQUENCE in SurfaceAppearance(scene).warnings[0]
+
+
+@pytest.mark.parametrize(("pitch", "slope"), [(90.0, 0.0), (30.0, 0.0), (10.0, 0.0), (30.0, 0.3)])
+def test_a_surface_is_foreshortened_as_round_patches_of_it_are_in_the_picture(pitch, slope):
+    turn, away = np.radians(pitch), 5.0
+    camera = PinholeCamera.looking((0.0, -away * np.cos(turn), away * np.sin(turn)), (0.0, 0.0, 0.0), 50.0, (320, 240))
+    rng = np.random.default_rng(0)
+    means = rng.uniform(-0.2, 0.2, (4000, 3))
+    means[:, 2] = slope * means[:, 1]
+    patch = means[np.linalg.norm(means[:, :2], axis=1) < 0.1] * [
+        1.0,
+        1.0 / np.hypot(1.0, slope),
+        1.0 / np.hypot(1.0, slope),
+    ]
+    wide, high = np.std(camera.project(patch)[0], axis=0)
+    assert foreshortening(camera, means) == pytest.approx(high / wide, abs=0.06)
 
 
 def test_another_film_is_another_look_and_a_missing_one_is_none(channel, tmp_path):

@@ -39,6 +39,10 @@ FEWEST = 8
 """frames: a shorter film has no life of its own to show"""
 
 
+Blur = tuple[float, float]
+"""standard deviations of a blur across and down the picture, px"""
+
+
 @dataclass(frozen=True)
 class FluidFootage:
     """Pictures of a fluid, taken apart.
@@ -64,17 +68,19 @@ class FluidFootage:
     """px to the nearest pixel that shows fluid (in `SHOWN` of the frames); 0 where it does"""
 
     @classmethod
-    def of(cls, frames: np.ndarray, fluid: np.ndarray, interval: float, *, blur: float = 0.0) -> FluidFootage | None:
+    def of(
+        cls, frames: np.ndarray, fluid: np.ndarray, interval: float, *, blur: Blur | None = None
+    ) -> FluidFootage | None:  # fmt: skip
         """From pictures u8 [T,H,W,3] and masks bool [T,H,W]; None where they are too few, or show no fluid.
 
         Args:
             frames: sRGB.
             fluid: in each of them.
             interval: s between them.
-            blur: standard deviation (px) of the splats that will show them, which is taken out beforehand.
+            blur: of the splats that will show them, which is taken out beforehand; None: none is.
         """
         require(frames.shape[:3] == fluid.shape, f"{frames.shape} pictures for masks {fluid.shape}", "one each")
-        if blur > 0:
+        if blur is not None:
             frames = np.stack([_sharpened(f, m, blur) for f, m in zip(frames, fluid, strict=True)])
         weight = fluid.mean(axis=0, dtype=np.float32)
         known = weight > SHOWN
@@ -165,10 +171,10 @@ class FluidFootage:
 
 
 def grain_kept(
-    frames: UInt8[np.ndarray, "t h w 3"], fluid: Bool[np.ndarray, "t h w"], blur: float
+    frames: UInt8[np.ndarray, "t h w 3"], fluid: Bool[np.ndarray, "t h w"], blur: Blur
 ) -> float:  # fmt: skip
     """Share of the amplitude of a film's finest band (of a Laplacian pyramid, in the fluid) that is left when splats
-    with a `blur` (px) show it, sharpened as it is for them; 1 where it has no grain.
+    with a `blur` show it, sharpened as it is for them; 1 where it has no grain.
 
     Args:
         frames: sRGB.
@@ -186,7 +192,7 @@ def grain_kept(
         inner = ndimage.binary_erosion(fluid[t], iterations=RIM, border_value=1)
         own, rounding = own + energy(frames[t], inner), rounding + inner.sum() / 12.0  # of whole numbers
         sharp = _sharpened(frames[t], fluid[t], blur).astype(np.float32)
-        shown += energy(cv2.GaussianBlur(sharp, (0, 0), blur), inner)
+        shown += energy(_blurred(sharp, blur), inner)
     return float(np.sqrt(shown / own)) if own > rounding else 1.0
 
 
@@ -197,19 +203,24 @@ def _without_rim(fluid: np.ndarray) -> np.ndarray:
     return inner | threads
 
 
-def _sharpened(picture: np.ndarray, fluid: np.ndarray, blur: float) -> np.ndarray:
+def _blurred(picture: np.ndarray, blur: Blur) -> np.ndarray:
+    """Gaussian blur of [h,w] or [h,w,3]; beyond the picture goes on what its edge shows."""
+    import cv2
+
+    return cv2.GaussianBlur(picture, (0, 0), sigmaX=blur[0], sigmaY=blur[1], borderType=cv2.BORDER_REPLICATE)
+
+
+def _sharpened(picture: np.ndarray, fluid: np.ndarray, blur: Blur) -> np.ndarray:
     """A picture that a blur G makes into the given one I, inside the fluid (van Cittert's deconvolution).
 
     X <- X + (I - G X), from X = I on, `SHARPER` times: frequencies that G leaves g of come out with 1 - (1 - g)^n of
     their size instead of g, n = `SHARPER` + 1, so noise is never amplified beyond what the blur takes from it.
     """
-    import cv2
-
     weight = fluid.astype(np.float32)
-    share = np.maximum(cv2.GaussianBlur(weight, (0, 0), blur, borderType=cv2.BORDER_REPLICATE), 1e-3)[..., None]
+    share = np.maximum(_blurred(weight, blur), 1e-3)[..., None]
     sharp = picture.astype(np.float32)
     for _ in range(SHARPER):
-        smooth = cv2.GaussianBlur(sharp * weight[..., None], (0, 0), blur, borderType=cv2.BORDER_REPLICATE) / share
+        smooth = _blurred(sharp * weight[..., None], blur) / share
         sharp = np.where(fluid[..., None], sharp + picture - smooth, sharp)
     return np.clip(np.rint(sharp), 0, 255).astype(np.uint8)
 

@@ -6,6 +6,7 @@ Modules of the face:
                    stands still
     cadence        Frames that repeat: frame-rate conversion (telecine, GIFs played as video) and stretches where
                    the picture stands
+    full_frame     Full-frame stabilisation: what a steadied frame does not see shows another time
     lift           Scene flow: optical flow unprojected by depth (paper: V_surf), the one place where px/frame
                    becomes m/s
     moving_camera  A clip of a camera that goes somewhere as from one that stands: each frame drawn again from one
@@ -23,6 +24,6 @@ Modules of the face:
 """
 
 __all__ = [
-    "align", "cadence", "lift", "moving_camera", "optical_flow", "sequence", "stabilize", "steady_flow", "thrown_up",
-    "volume",
+    "align", "cadence", "full_frame", "lift", "moving_camera", "optical_flow", "sequence", "stabilize", "steady_flow",
+    "thrown_up", "volume",
 ]  # fmt: skip

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from fluidlift.errors import MissingPackage
 from fluidlift.messages import Notice
@@ -222,10 +222,14 @@ def gain(grey: Sequence[np.ndarray], steady: Sequence[np.ndarray], walk: Walked)
     return float((after < before - BETTER).mean() - (after > before + BETTER).mean())
 
 
-def drawn_again(frames: np.ndarray, walk: Walked, out: np.ndarray, alpha: np.ndarray | None = None) -> None:
+def drawn_again(
+    frames: np.ndarray, walk: Walked, out: np.ndarray, alpha: np.ndarray | None = None,
+    unseen: Callable[[int, Bool[np.ndarray, "h w"]], None] | None = None,
+) -> None:  # fmt: skip
     """All frames u8 [T,H,W,3] from the place of the reference, written to `out`; alpha [T,H,W] is overwritten.
 
-    What a frame does not see is what the frame before it, on the way from the reference, shows there.
+    What a frame does not see is what the frame before it, on the way from the reference, shows there; `unseen` is told
+    where that is.
     """
     count, height, width = frames.shape[:3]
     inverse = walk.inverse_depth((width, height))
@@ -238,6 +242,8 @@ def drawn_again(frames: np.ndarray, walk: Walked, out: np.ndarray, alpha: np.nda
                 picture = cv2.remap(picture, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
                 hidden = (u < -0.5) | (v < -0.5) | (u > width - 0.5) | (v > height - 0.5)
                 picture[hidden] = out[before][hidden]
+                if unseen is not None:
+                    unseen(t, hidden)
                 if alpha is not None:
                     alpha[t] = cv2.remap(
                         np.ascontiguousarray(alpha[t]), u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE

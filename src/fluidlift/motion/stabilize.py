@@ -13,12 +13,12 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
-from scipy import ndimage
+from jaxtyping import Bool
 
 from fluidlift.errors import require
 from fluidlift.messages import Notice
 from fluidlift.motion.camera_motion import camera_motion
+from fluidlift.motion.full_frame import UnseenEdges, fill_unseen
 from fluidlift.motion.moving_camera import Walked, Walking, drawn_again, walked
 from fluidlift.numerics.homography2 import carried, drawn_back
 from fluidlift.types import MeasuredView
@@ -71,6 +71,8 @@ class ShakeReport:
     """how the camera stood over the water, where it went somewhere and its path was found"""
     fluid_evidence: np.ndarray | None = None
     """float32 [h,w], log odds of fluid from that path, of the whole picture at a size of its own"""
+    unseen: np.ndarray | None = None
+    """bool [T,h,w], `UnseenEdges.cells` of a picture that was warped"""
 
 
 class GreyFrames(Sequence[np.ndarray]):
@@ -131,16 +133,16 @@ def stabilise(
         begin, end, reference = steady_run(motions[first:last], clip.size, least_overlap)
         runs.append((first + begin, first + end))
         laid[first:last] = motions[first:last] @ np.linalg.inv(motions[first + reference])
-    steady = warp_back(clip, laid, runs, out)
+    edges_of = UnseenEdges(len(clip), clip.size)
+    steady = warp_back(clip, laid, runs, out, edges_of)
     if walking is not None and drift > MAY_WALK * max(width, height):
         first, last = max(runs, key=lambda run: run[1] - run[0])
         laid_plainly = GreyFrames(steady.frames, first, last)
         walk, said = walked(GreyFrames(clip.frames, first, last), walking, laid_plainly)
         if walk is not None:
-            _laid_anew(clip, steady, walk, (first, last))
-            path = path_of(laid, clip.size)
-            seen = walk.view, walk.fluid_evidence
-            return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings), path, *seen)
+            _laid_anew(clip, steady, walk, (first, last), edges_of)
+            told = path_of(laid, clip.size), walk.view, walk.fluid_evidence, _filled(steady, runs, edges_of)
+            return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings), *told)
         warnings += [] if said is None else [said]
     again = [shake_and_drift(motions_of_shots(steady.frames[a:b], (), reach)[0], width, height, ()) for a, b in runs]
     left, away = (max(each) for each in zip(*again))
@@ -155,7 +157,8 @@ def stabilise(
                     "what is near still moves",
                 )
             )
-        return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings), path_of(laid, clip.size))
+        path, unseen = path_of(laid, clip.size), _filled(steady, runs, edges_of)
+        return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings), path, unseen=unseen)
     warnings.append(
         Notice(
             "camera-motion-unclear",
@@ -165,13 +168,24 @@ def stabilise(
     return clip, ShakeReport(shake, drift, False, cuts, shots, tuple(warnings), path_of(laid, clip.size))
 
 
-def _laid_anew(clip: VideoClip, steady: VideoClip, walk: Walked, run: tuple[int, int]) -> None:
+def _filled(steady: VideoClip, runs: Sequence[tuple[int, int]], edges: UnseenEdges) -> Bool[np.ndarray, "t h w"]:
+    """What no frame of a steadied clip sees, whose edges show other times of it from here on."""
+    for first, last in runs:
+        fill_unseen(steady.frames[first:last], edges.cells[first:last])
+    return edges.cells
+
+
+def _laid_anew(
+    clip: VideoClip, steady: VideoClip, walk: Walked, run: tuple[int, int], edges: UnseenEdges
+) -> None:  # fmt: skip
     """Write one run of frames over what was laid as of a camera that only turns."""
     part = slice(*run)
     alpha = None if steady.alpha is None or clip.alpha is None else steady.alpha[part]
     if alpha is not None and clip.alpha is not None:
         alpha[:] = clip.alpha[part]
-    drawn_again(clip.frames[part], walk, steady.frames[part], alpha)
+    drawn_again(
+        clip.frames[part], walk, steady.frames[part], alpha, unseen=lambda t, hidden: edges.put(run[0] + t, hidden)
+    )
 
 
 def path_of(motions: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -277,30 +291,15 @@ def shake_and_drift(motions: np.ndarray, width: int, height: int, cuts: tuple[in
     return shake, float(np.linalg.norm(moved, axis=-1).mean(axis=-1).max())
 
 
-def own_pixels(frames: UInt8[np.ndarray, "t h w 3"]) -> Bool[np.ndarray, "t h w"]:
-    """What each frame of a steadied clip saw itself: elsewhere, in from the picture's edge, it repeats a neighbour to
-    the bit (`warp_back`).
-
-    Which of two such frames is the one that saw it is not asked: both count as blind there.
-    """
-    own = np.ones(frames.shape[:3], bool)
-    for t in range(1, len(frames)):
-        same = (frames[t] == frames[t - 1]).all(axis=-1)
-        edge = np.zeros(same.shape, bool)
-        edge[[0, -1]], edge[:, [0, -1]] = same[[0, -1]], same[:, [0, -1]]
-        repeated = ndimage.binary_propagation(edge, mask=same)
-        own[t] &= ~repeated
-        own[t - 1] &= ~repeated
-    return own
-
-
 def warp_back(
-    clip: VideoClip, motions: np.ndarray, runs: Sequence[tuple[int, int]], out: np.ndarray | None = None
-) -> VideoClip:
+    clip: VideoClip, motions: np.ndarray, runs: Sequence[tuple[int, int]], out: np.ndarray | None = None,
+    edges: UnseenEdges | None = None,
+) -> VideoClip:  # fmt: skip
     """The clip with every frame of the runs carried back to its reference.
 
     What a frame does not see is what the frame before it, on the way from the reference, shows there: its own picture
-    or what was filled in (full-frame stabilisation by mosaics, Litvin et al. 2003, without their blending).
+    or what was filled in (full-frame stabilisation by mosaics, Litvin et al. 2003, without their blending). `edges`
+    notes where that is.
     """
     frames = np.empty(clip.frames.shape, np.uint8) if out is None else out
     alpha = None if clip.alpha is None else np.array(clip.alpha)
@@ -316,6 +315,8 @@ def warp_back(
                 seen = drawn_back(inside, motions[t], clip.size, interpolation=cv2.INTER_NEAREST)
                 if t != reference:
                     picture[seen == 0] = frames[before][seen == 0]
+                    if edges is not None:
+                        edges.put(t, seen == 0)
                 frames[t], before = picture, t
                 if alpha is not None:
                     alpha[t] = drawn_back(alpha[t], motions[t], clip.size, **edged)

@@ -95,7 +95,7 @@ def card_of_run(
         coverage: bool [K,H,W], pixels that the fluid covers.
     """
     from fluidlift.evaluate.as_filmed import FEWEST, as_filmed
-    from fluidlift.motion.stabilize import own_pixels
+    from fluidlift.motion.full_frame import seen_pixels
 
     reason = why_not(scene, footage, preview=preview)
     if reason is None and len(renders) < FEWEST:
@@ -106,7 +106,7 @@ def card_of_run(
     card = as_filmed(
         frames, footage.labels.fluid[footage.start :], scene.interval, renders, coverage,
         runs=not kind.is_still_water, fills=kind.fills_vessel,
-        seen=own_pixels(frames) if footage.steadied else None,
+        seen=None if footage.unseen is None else seen_pixels(footage.unseen[footage.start :], footage.clip.size),
     )  # fmt: skip
     warning = card.warning()
     return Noted(card.to_dict(), (warning,) if warning else ())

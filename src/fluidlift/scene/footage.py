@@ -24,12 +24,13 @@ class Footage:
     """bool [H,W], pixels in which something solid stands in or before the fluid"""
     before: np.ndarray | None = None
     """bool [H,W], pixels in which something that is no part of the ground hides all fluid; None: nothing does"""
-    steadied: bool = False
-    """whether its frames were laid on one of them: at their edges they show then what others saw"""
+    unseen: np.ndarray | None = None
+    """bool [T,h,w], cells of the picture that each frame did not see itself, where it was steadied
+    (`motion.full_frame`)"""
 
 
 def footage_of(read: Read, segmentation: Segmentation, geometry: Geometry) -> Footage:
     """The clip as the first stages saw it."""
     labels = segmentation.labels
     rocks = geometry.rocks if geometry.rocks is not None else labels.solid.mean(axis=0) > 0.5
-    return Footage(read.clip, labels, geometry.plate, geometry.rest_frame, rocks, geometry.hidden, read.stabilised)
+    return Footage(read.clip, labels, geometry.plate, geometry.rest_frame, rocks, geometry.hidden, read.unseen)

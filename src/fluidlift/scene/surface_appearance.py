@@ -204,8 +204,9 @@ class SurfaceAppearance:
         gravity = np.asarray(scene.parameters.gravity, np.float64)
         upright = -gravity[2] > UPRIGHT * max(float(np.linalg.norm(gravity)), 1e-12)
         kind = kind_of(scene.kind)
-        footage, stands = self._film_of(own), kind.is_still_water
-        if kind.is_level_throughout and upright:
+        level = kind.is_level_throughout and upright
+        footage, stands = self._film_of(own, level=level), kind.is_still_water
+        if level:
             self._axes = PlanAxes()
         elif footage is not None:
             self._axes = PictureAxes(self._camera, float(np.median(self._camera.project(own.means)[1])))
@@ -265,14 +266,14 @@ class SurfaceAppearance:
             return None
         return SmokeAppearance(self._scene, found)
 
-    def _film_of(self, own: Gaussians) -> FluidFootage | None:
+    def _film_of(self, own: Gaussians, *, level: bool) -> FluidFootage | None:
         """The film that the surface plays, whose size the camera has from here on; one that cannot be is a warning."""
         from fluidlift.look.scenery import terrain_depth
 
         scene = self._scene
         if scene.film is None:
             return None
-        found = surface_film(scene.film, scene.camera, own.means, self._cell)
+        found = surface_film(scene.film, scene.camera, own.means, self._cell, level=level)
         if isinstance(found, str):
             self._missing = (Notice("film-not-played", f"the film of the fluid {found}"),)
             return None

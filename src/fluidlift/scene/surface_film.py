@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +14,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.types import PinholeCamera, kind_of
 
 if TYPE_CHECKING:
-    from fluidlift.look.footage import FluidFootage
+    from fluidlift.look.footage import Blur, FluidFootage
     from fluidlift.look.texture_patches import FirstEnd
     from fluidlift.scene.build import Scene
 
@@ -47,7 +48,7 @@ def first_end(scene: Scene) -> FirstEnd:
 
 
 def surface_film(
-    path: Path, camera: PinholeCamera, means: Float[np.ndarray, "n 3"], cell: float
+    path: Path, camera: PinholeCamera, means: Float[np.ndarray, "n 3"], cell: float, *, level: bool = False
 ) -> tuple[FluidFootage, float] | str:
     """The film of an asset, taken apart, and how far apart (px of it) are what shows it; or what is wrong with it.
 
@@ -56,6 +57,7 @@ def surface_film(
         camera: that took it.
         means: of the body's Gaussians, m.
         cell: width of the simulator's cells, m.
+        level: the skin that plays it lies on a map of heights, and is seen foreshortened; else it faces the camera.
     """
     from fluidlift.io.footage_file import size_of_film
     from fluidlift.look.surface_skin import PITCH, WIDTH, finer, level_for
@@ -64,16 +66,33 @@ def surface_film(
         return f"is missing: {AS_AT_REST}; make the asset again"
     small = camera.resized(size_of_film(camera.size))
     coarse = PITCH * cell * small.focal[0] / np.maximum(small.project(means)[1], 1e-6)
-    apart = [float(np.median(coarse * finer(level_for(coarse, wanted)))) for wanted in (FINE, FINER)]
-    usual, closer = (float(np.sqrt((WIDTH * a) ** 2 + LOOKED_UP)) for a in apart)
+    apart = [WIDTH * float(np.median(coarse * finer(level_for(coarse, wanted)))) for wanted in (FINE, FINER)]
+    flat = foreshortening(small, means) if level else 1.0
+    usual, closer = ((math.sqrt(a**2 + LOOKED_UP), math.sqrt((flat * a) ** 2 + LOOKED_UP)) for a in apart)
     written = path.stat()
     found = _taken_apart(path, camera.size, (usual, closer), (written.st_mtime_ns, written.st_size))
     return found if isinstance(found, str) else (found[0], FINER if found[1] else FINE)
 
 
+def foreshortening(camera: PinholeCamera, means: Float[np.ndarray, "n 3"]) -> float:
+    """How high in the picture, of its width there, a round patch of a surface is that faces up: at most 1.
+
+    Args:
+        camera: that sees it.
+        means: places of the surface, m; the plane through them is asked for, in their middle.
+    """
+    middle = np.median(means, axis=0)
+    away = means - middle
+    slopes = np.linalg.lstsq(away[:, :2], away[:, 2], rcond=None)[0]
+    normal = np.append(-slopes, 1.0)
+    normal /= np.linalg.norm(normal)
+    toward = camera.position - middle
+    return float(np.clip(abs(normal @ toward) / max(float(np.linalg.norm(toward)), 1e-9), 0.0, 1.0))
+
+
 @lru_cache(maxsize=1)
 def _taken_apart(
-    path: Path, size: tuple[int, int], blurs: tuple[float, float], written: tuple[int, int]
+    path: Path, size: tuple[int, int], blurs: tuple[Blur, Blur], written: tuple[int, int]
 ) -> tuple[FluidFootage, bool] | str:
     """As `surface_film`, of a file as it was `written`, and whether the second, smaller of two blurs was taken.
 

@@ -68,6 +68,9 @@ class Read:
     """how the camera stood over the water, where it went somewhere and its path tells that"""
     fluid_evidence: Float[np.ndarray, "h w"] | None = None
     """log odds of fluid of the whole picture, at a size of its own, where the camera's path tells what stands"""
+    unseen: Bool[np.ndarray, "t a b"] | None = None
+    """cells of the picture that each frame did not see itself, where the shake was taken out
+    (`motion.full_frame.UnseenEdges`)"""
 
     def __post_init__(self) -> None:
         require(self.path is None or len(self.path) == len(self.clip), "a path of other frames")

@@ -84,8 +84,9 @@ def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, wor
     said = (*found.warnings, *(w for w in shake.warnings if w not in found.warnings), *warnings)
     path = None if shake.path is None else shake.path[first:last]
     return Read(
-        used, kept, decoded, shake.shake_px, shake.stabilised, shake.cuts, said, path, shake.view, shake.fluid_evidence
-    )
+        used, kept, decoded, shake.shake_px, shake.stabilised, shake.cuts, said, path, shake.view, shake.fluid_evidence,
+        None if shake.unseen is None else shake.unseen[first:last],
+    )  # fmt: skip
 
 
 def _cut_off(bars: PictureWindow) -> Notice:
@@ -170,6 +171,7 @@ class _Shake:
     """[T,2] px, as in `motion.stabilize.ShakeReport`"""
     view: MeasuredView | None = None
     fluid_evidence: np.ndarray | None = None
+    unseen: np.ndarray | None = None
 
 
 def _walking(clip: GivenFile, camera: GivenFile | None, size: tuple[int, int]) -> Walking:
@@ -202,7 +204,7 @@ def _steady(clip: VideoClip, scratch: Scratch, walking: Walking, *, correct: boo
     cuts = tuple(int(c) for c in shake.cuts)
     return steady, _Shake(
         float(shake.shake_px), bool(shake.stabilised), cuts, shake.runs, shake.warnings, shake.path,
-        shake.view, shake.fluid_evidence,
+        shake.view, shake.fluid_evidence, shake.unseen,
     )  # fmt: skip
 
 

@@ -4,9 +4,16 @@ import cv2
 import numpy as np
 import pytest
 
-from fluidlift.motion.full_frame import FEWEST, UnseenEdges, donors, fill_unseen, seen_pixels
+from fluidlift.config import JobConfig
+from fluidlift.motion.full_frame import FEWEST, UnseenEdges, donors, lent, seen_pixels
 from fluidlift.motion.stabilize import stabilise
-from fluidlift.types import VideoClip
+from fluidlift.pipeline.hints import NO_HINTS
+from fluidlift.pipeline.inputs import GivenFile
+from fluidlift.pipeline.settings import GivenMask, SegmentSettings
+from fluidlift.pipeline.stages.segment import segment
+from fluidlift.pipeline.work import Work
+from fluidlift.types import Label, PixelFlow, PixelLabels, VideoClip
+from fluidlift.types.stages import Flow, Read
 
 FRAMES, HEIGHT, WIDTH = 60, 90, 160
 
@@ -50,24 +57,27 @@ def test_a_cell_is_unseen_where_any_of_its_pixels_is():
     assert seen[0].all() and not seen[1][719, 640] and seen[1].mean() > 0.99
 
 
-def test_the_fill_blends_in_and_leaves_what_was_seen():
-    frames = np.zeros((40, 96, 128, 3), np.uint8)
-    frames[:] = np.arange(40)[:, None, None, None]
+def test_what_is_lent_blends_in_and_leaves_what_was_seen():
     cells = blind(np.repeat([0, 3], [20, 20]))
-    before = frames.copy()
-    fill_unseen(frames, cells)
-    assert np.array_equal(frames[:20], before[:20])
-    assert np.array_equal(frames[:, :56], before[:, :56]), "more than a cell beside it"
-    lent = donors(cells)[20:]
-    assert (frames[20:, 74:] == lent[:, None, None, None]).all()
-    across = frames[20, :, 0, 0].astype(int)
-    assert (np.diff(across) <= 0).all() and len(np.unique(across)) > 4, "no seam"
+    lending = list(lent(cells, (128, 96)))
+    assert [t for t, _, _ in lending] == list(range(20, 40)) and [d for _, d, _ in lending] == donors(cells)[
+        20:
+    ].tolist()
+    for _, _, share in lending:
+        assert (share[74:] == 1).all() and (share[:56] == 0).all(), "within its cells, and more than a cell beside them"
+        across = share[:, 0]
+        assert (np.diff(across) >= 0).all() and len(np.unique(across)) > 4, "no seam"
+
+
+def test_no_frame_lends_what_it_does_not_see_itself():
+    cells = blind(np.repeat([3, 0, 1], [10, 20, 10]))
+    for _, donor, share in lent(cells, (128, 96)):
+        assert (share[~seen_pixels(cells[donor][None], (128, 96))[0]] < 0.5).all()
 
 
 @pytest.fixture(scope="module")
-def hand_held() -> tuple[VideoClip, np.ndarray]:
-    """A river below a still bank, from a camera that tilts up, and the river as it is; what lies beside the picture
-    comes into it."""
+def hand_held() -> VideoClip:
+    """A river below a still bank, from a camera that tilts up."""
     rng = np.random.default_rng(2)
     tall, wide = HEIGHT + 40, WIDTH + 2 * FRAMES + 40
 
@@ -80,16 +90,36 @@ def hand_held() -> tuple[VideoClip, np.ndarray]:
     up = np.clip(np.arange(FRAMES) - 20, 0, 20)
     frames = [world[t, 20 - n : 20 - n + HEIGHT, 20 : 20 + WIDTH] for t, n in enumerate(up)]
     clip = np.repeat(np.stack(frames).round().astype(np.uint8)[..., None], 3, axis=-1)
-    return VideoClip(clip, np.arange(FRAMES) / 30.0, "made"), world
+    return VideoClip(clip, np.arange(FRAMES) / 30.0, "made")
 
 
-def test_water_at_an_edge_that_was_left_goes_on_to_move(hand_held):
-    clip, _ = hand_held
-    steady, report = stabilise(clip)
+@pytest.mark.parametrize("drawn", [False, True])
+def test_water_at_an_edge_that_was_left_goes_on_to_move(hand_held, tmp_path, monkeypatch, drawn):
+    """The mask of what stands still there says that it is none; one that a person drew is left as it is."""
+    steady, report = stabilise(hand_held)
     assert report.stabilised and report.unseen is not None
-    hidden = ~seen_pixels(report.unseen, clip.size)
-    moves = np.abs(np.diff(steady.frames[..., 0].astype(float), axis=0))
-    edge, water = hidden[1:] & hidden[:-1], np.zeros(moves.shape, bool)
+    hidden = ~seen_pixels(report.unseen, hand_held.size)
+    water = np.zeros(hidden.shape, bool)
     water[:, HEIGHT // 2 + 10 :] = True
+    labels = np.where(water & ~hidden, Label.FLUID, Label.BACKGROUND).astype(np.uint8)
+    found = PixelLabels(labels.copy(), np.full(labels.shape, 0.5, np.float16))
+    monkeypatch.setattr("fluidlift.shape.segment.segment", lambda *_, **__: found)
+    read = Read(steady, np.arange(FRAMES), FRAMES, 0.5, True, unseen=report.unseen)
+    none = np.zeros((FRAMES - 1, *steady.frames.shape[1:3]), np.float32)
+    flow = Flow(PixelFlow(np.stack([none, none], axis=-1), np.ones_like(none)), "dis")
+    mask = GivenMask(GivenFile(tmp_path, ""), None, 0.0, None) if drawn else None
+    monkeypatch.setattr("fluidlift.pipeline.stages.segment.drawn_mask", lambda *_: labels == Label.FLUID)
+    made = segment(read, flow, mask, SegmentSettings.of(JobConfig()), NO_HINTS, work=Work.alone(tmp_path))
+    assert made.whole is not None
+    moves = np.abs(np.diff(made.whole[..., 0].astype(float), axis=0))
+    still = np.abs(np.diff(steady.frames[..., 0].astype(float), axis=0))
+    edge = hidden[1:] & hidden[:-1] & water[1:]
     assert edge[40:].any(axis=(1, 2)).all()
-    assert moves[edge & water].mean() > 0.8 * moves[~edge & water].mean(), "it stood still"
+    seen = water[1:] & ~hidden[1:] & ~hidden[:-1]
+    assert moves[edge].mean() > 0.7 * moves[seen].mean() > 3 * still[edge].mean()
+    ground = hidden & ~water
+    ground[:, HEIGHT // 2 - 5 :] = False
+    np.testing.assert_array_equal(made.whole[ground], steady.frames[ground])
+    fluid = made.labels.labels == Label.FLUID
+    assert (fluid == (labels == Label.FLUID)).all() if drawn else fluid[hidden & water].mean() > 0.9
+    assert not fluid[~water].any()

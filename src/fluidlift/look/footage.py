@@ -26,7 +26,7 @@ RIM = 2
 """px inside its outline in which a pixel may show half of the bank: lens, coding and mask are no sharper than that. It
 does in its own place, as filmed, and nowhere else"""
 
-SHARPER = 2
+SHARPER = 3
 """steps of the deconvolution. Of 1, 2 and 3, 2 is nearest to the energy of clips in three bands (0.9 to 1.1 of it)"""
 
 LOOKS = 5

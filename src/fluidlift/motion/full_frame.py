@@ -4,16 +4,18 @@ Laid on the others, a frame of a hand-held clip leaves an edge of the picture un
 last, ground is as it should be, but a fluid stands still there: in the film of its surface it is frozen, and to all
 that looks for fluid by its motion it is none. Other times of the same place show it as it moves (full-frame
 stabilisation by mosaics: Litvin et al. 2003; motion inpainting: Matsushita et al. 2006), and stretches of the clip that
-go on for longest make the fewest breaks.
+go on for longest make the fewest breaks. Ground stays as it was seen last: other times lie beside it by a pixel or two,
+and it would jump with every break.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 LONGEST = 160
 """cells of the longer side in which it is kept what a frame sees: 3 px of 512, over which the fill blends in"""
@@ -80,21 +82,21 @@ def donors(cells: Bool[np.ndarray, "t h w"]) -> Int[np.ndarray, " t"]:
     return found
 
 
-def fill_unseen(frames: np.ndarray, cells: Bool[np.ndarray, "t h w"]) -> None:
-    """Show in steadied frames u8 [T,H,W,3], in place, at their unseen edges what their donors see there."""
-    size = frames.shape[2], frames.shape[1]
-    for first in range(0, len(frames), TOGETHER):
+def lent(
+    cells: Bool[np.ndarray, "t h w"], size: tuple[int, int]
+) -> Iterator[tuple[int, int, Float[np.ndarray, "H W"]]]:  # fmt: skip
+    """Frames that are lent what they do not see: number, that of the donor, and the donor's share in each pixel, which
+    is 1 where it alone sees and falls to 0 over a cell beside that.
+
+    Args:
+        cells: what each frame does not see.
+        size: width and height of the pictures, px.
+    """
+    for first in range(0, len(cells), TOGETHER):
         part = cells[first : first + TOGETHER]
         for t, donor in enumerate(donors(part)):
-            if donor < 0:
-                continue
-            weight = _weight(part[t], size) * (1.0 - _weight(part[donor], size))
-            there = weight > 0
-            share = weight[there][:, None]
-            own, other = frames[first + t][there], frames[first + donor][there]
-            picture = np.array(frames[first + t])
-            picture[there] = np.rint(own + share * (other.astype(np.float32) - own)).astype(np.uint8)
-            frames[first + t] = picture
+            if donor >= 0:
+                yield first + t, first + int(donor), _weight(part[t], size) * (1.0 - _weight(part[donor], size))
 
 
 def _spread(cells: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

@@ -13,12 +13,11 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
 
 from fluidlift.errors import require
 from fluidlift.messages import Notice
 from fluidlift.motion.camera_motion import camera_motion
-from fluidlift.motion.full_frame import UnseenEdges, fill_unseen
+from fluidlift.motion.full_frame import UnseenEdges
 from fluidlift.motion.moving_camera import Walked, Walking, drawn_again, walked
 from fluidlift.numerics.homography2 import carried, drawn_back
 from fluidlift.types import MeasuredView
@@ -141,7 +140,7 @@ def stabilise(
         walk, said = walked(GreyFrames(clip.frames, first, last), walking, laid_plainly)
         if walk is not None:
             _laid_anew(clip, steady, walk, (first, last), edges_of)
-            told = path_of(laid, clip.size), walk.view, walk.fluid_evidence, _filled(steady, runs, edges_of)
+            told = path_of(laid, clip.size), walk.view, walk.fluid_evidence, edges_of.cells
             return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings), *told)
         warnings += [] if said is None else [said]
     again = [shake_and_drift(motions_of_shots(steady.frames[a:b], (), reach)[0], width, height, ()) for a, b in runs]
@@ -157,8 +156,8 @@ def stabilise(
                     "what is near still moves",
                 )
             )
-        path, unseen = path_of(laid, clip.size), _filled(steady, runs, edges_of)
-        return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings), path, unseen=unseen)
+        path = path_of(laid, clip.size)
+        return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings), path, unseen=edges_of.cells)
     warnings.append(
         Notice(
             "camera-motion-unclear",
@@ -166,13 +165,6 @@ def stabilise(
         )
     )
     return clip, ShakeReport(shake, drift, False, cuts, shots, tuple(warnings), path_of(laid, clip.size))
-
-
-def _filled(steady: VideoClip, runs: Sequence[tuple[int, int]], edges: UnseenEdges) -> Bool[np.ndarray, "t h w"]:
-    """What no frame of a steadied clip sees, whose edges show other times of it from here on."""
-    for first, last in runs:
-        fill_unseen(steady.frames[first:last], edges.cells[first:last])
-    return edges.cells
 
 
 def _laid_anew(

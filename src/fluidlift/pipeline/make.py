@@ -220,7 +220,9 @@ def _write_film(lift: Lift, folder: Path) -> None:
     from fluidlift.io.footage_file import write_footage, write_smoke
 
     film, clip, part = folder / FILES["film"], lift.clip, _film_part(lift)
-    frames, fluid, hidden = clip.frames[part], FluidMasks(lift.labels.labels)[part], lift.geometry.hidden
+    whole = lift.segmentation.whole
+    frames, fluid = (clip.frames if whole is None else whole)[part], FluidMasks(lift.labels.labels)[part]
+    hidden = lift.geometry.hidden
     if hidden is not None:
         behind = HiddenFluid.of(hidden, lift.geometry.mask)
         frames, fluid = behind.pictures(frames), behind.pictures(fluid)

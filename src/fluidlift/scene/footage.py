@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,4 +33,5 @@ def footage_of(read: Read, segmentation: Segmentation, geometry: Geometry) -> Fo
     """The clip as the first stages saw it."""
     labels = segmentation.labels
     rocks = geometry.rocks if geometry.rocks is not None else labels.solid.mean(axis=0) > 0.5
-    return Footage(read.clip, labels, geometry.plate, geometry.rest_frame, rocks, geometry.hidden, read.unseen)
+    clip = read.clip if segmentation.whole is None else replace(read.clip, frames=segmentation.whole)
+    return Footage(clip, labels, geometry.plate, geometry.rest_frame, rocks, geometry.hidden, read.unseen)

@@ -126,6 +126,8 @@ class Segmentation:
     likely_overlap: float | None = None
     """intersection over union with what is fluid, as the labels' confidence has it, 0 to 1; None: not known, or a
     person drew all of it"""
+    whole: UInt8[np.ndarray, "t h w 3"] | None = None
+    """frames of a steadied clip whose fluid goes on where they do not see it (`motion.full_frame`); None: the clip's"""
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,9 @@ def correct(
     kept = PixelLabels(work.scratch.keep("labels", labels), work.scratch.keep("confidence", confidence))
     share, sure, trusted, likely = figures
     asked = None if segmentation.likely_overlap is None else likely  # None: a person drew all of it
-    return Segmentation(kept, share, sure, trusted, segmentation.user_mask, likely_overlap=asked)
+    return Segmentation(
+        kept, share, sure, trusted, segmentation.user_mask, likely_overlap=asked, whole=segmentation.whole
+    )
 
 
 def _frames_of(region: Region, times: np.ndarray) -> np.ndarray:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
+from jaxtyping import Bool, UInt8
 
 from fluidlift.backends.learned import MASK_METHODS, make_segmenter
 from fluidlift.backends.registry import ModelChoice
@@ -15,7 +17,7 @@ from fluidlift.pipeline.settings import GivenMask, SegmentSettings
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Segmenter
 from fluidlift.shape.fluid_found import fluid_figures
-from fluidlift.types import PixelFlow, PixelLabels, VideoClip
+from fluidlift.types import Label, PixelFlow, PixelLabels, VideoClip
 from fluidlift.types.fluid_masks import parts_of
 from fluidlift.types.stages import Flow, Read, Segmentation
 
@@ -53,6 +55,7 @@ def segment(
             progress=lambda part, _: work.step(round(100 * part), 100), out=out,
             clues=lambda: work.remembered("clues", clues, read, flow, hints.roi),
         )  # fmt: skip
+    whole = None if read.unseen is None else _beyond_edges(clip, read.unseen, labels, work, drawn=mask is not None)
     found = fluid_figures(labels, flow.flow)
     if found is None:
         raise InputRejected(
@@ -69,7 +72,35 @@ def segment(
         )
     kept = work.scratch.keep("labels", labels.labels), work.scratch.keep("confidence", _halved(work, labels.confidence))
     share, sure, trusted, likely = found
-    return Segmentation(PixelLabels(*kept), share, sure, trusted, mask is not None, tuple(warnings), likely)
+    return Segmentation(PixelLabels(*kept), share, sure, trusted, mask is not None, tuple(warnings), likely, whole)
+
+
+def _beyond_edges(
+    clip: VideoClip, unseen: Bool[np.ndarray, "t a b"], labels: PixelLabels, work: Work, *, drawn: bool
+) -> UInt8[np.ndarray, "t h w 3"] | None:
+    """The clip's frames in which the fluid goes on where a steadied frame does not see it, and the labels with it, in
+    place, where a person has not `drawn` them; None where that changes nothing."""
+    from fluidlift.motion.full_frame import lent
+
+    frames, whole = clip.frames, None
+    for t, donor, weight in lent(unseen, clip.size):
+        fluid = labels.labels[donor] == Label.FLUID
+        share = weight * cv2.blur(fluid.astype(np.float32), (3, 3))
+        there = share > 0
+        if not there.any():
+            continue
+        if whole is None:
+            whole = work.scratch.array("whole", frames.shape, np.uint8)
+            for part in parts_of(whole):
+                whole[part] = frames[part]
+        own, picture = frames[t][there].astype(np.float32), whole[t].copy()
+        picture[there] = np.rint(own + share[there][:, None] * (frames[donor][there] - own)).astype(np.uint8)
+        whole[t] = picture
+        if not drawn:
+            taken = fluid & (weight > 0.5)
+            labels.labels[t][taken] = Label.FLUID
+            labels.confidence[t][taken] = labels.confidence[donor][taken]
+    return None if whole is None else work.scratch.keep("whole", whole)
 
 
 def clues(read: Read, flow: Flow, roi: tuple[int, int, int, int] | None) -> Clues:

@@ -27,7 +27,8 @@ RIM = 2
 does in its own place, as filmed, and nowhere else"""
 
 SHARPER = 3
-"""steps of the deconvolution. Of 1, 2 and 3, 2 is nearest to the energy of clips in three bands (0.9 to 1.1 of it)"""
+"""steps of the deconvolution. With 2 and 3 the finest band of five level waters has 0.89 to 0.99 and 0.95 to 1.06 of
+the clip's, that of four falls 0.77 to 1.11 and 0.82 to 1.11"""
 
 LOOKS = 5
 """frames of a film in which its grain is looked at: they are alike"""

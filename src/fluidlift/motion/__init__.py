@@ -6,7 +6,8 @@ Modules of the face:
                    stands still
     cadence        Frames that repeat: frame-rate conversion (telecine, GIFs played as video) and stretches where
                    the picture stands
-    full_frame     Full-frame stabilisation: what a steadied frame does not see shows another time
+    full_frame     Full-frame stabilisation: what a steadied frame does not see shows another time at which the
+                   camera did see it
     lift           Scene flow: optical flow unprojected by depth (paper: V_surf), the one place where px/frame
                    becomes m/s
     moving_camera  A clip of a camera that goes somewhere as from one that stands: each frame drawn again from one

@@ -1,11 +1,12 @@
 """Full-frame stabilisation: what a steadied frame does not see shows another time at which the camera did see it.
 
 Laid on the others, a frame of a hand-held clip leaves an edge of the picture uncovered. Filled with what was seen there
-last, ground is as it should be, but a fluid stands still there: in the film of its surface it is frozen, and to all
-that looks for fluid by its motion it is none. Other times of the same place show it as it moves (full-frame
-stabilisation by mosaics: Litvin et al. 2003; motion inpainting: Matsushita et al. 2006), and stretches of the clip that
-go on for longest make the fewest breaks. Ground stays as it was seen last: other times lie beside it by a pixel or two,
-and it would jump with every break.
+last, ground is as it should be, but a fluid stands still there: in the film of its surface it is frozen, and the mask
+has holes where it does not move. Other times of the same place show it as it moves (full-frame stabilisation by
+mosaics: Litvin et al. 2003; motion inpainting: Matsushita et al. 2006), and stretches of the clip that go on for
+longest make the fewest breaks. Ground stays as it was seen last: other times lie beside it by a pixel or two, and it
+would jump with every break. Which is which is known once the fluid is found. It is looked for in pictures that stand
+still there: in those that were filled so before, the masks of four of seven clips lost 0.02 to 0.11 (two gained 0.02).
 """
 
 from __future__ import annotations

@@ -145,6 +145,8 @@ def test_a_clip_is_steadied_by_its_path(filmed):
     steady, report = stabilise(clip_of(filmed["sideways"].frames), walking=Walking(Lens(GUESS), colmap))
     assert report.stabilised and report.view is not None and report.fluid_evidence is not None
     assert report.warnings == () and len(steady) == FRAMES
+    assert report.unseen is not None and report.unseen[[0, -1]].any()
+    assert not report.unseen[FRAMES // 2].any(), "what all are laid on sees itself, whichever was it as of a turn"
 
 
 def test_a_camera_that_turns_is_steadied_as_before(filmed):

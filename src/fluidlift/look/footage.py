@@ -39,7 +39,6 @@ AGREE = 3
 FEWEST = 8
 """frames: a shorter film has no life of its own to show"""
 
-
 Blur = tuple[float, float]
 """standard deviations of a blur across and down the picture, px"""
 

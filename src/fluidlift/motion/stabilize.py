@@ -132,15 +132,15 @@ def stabilise(
         begin, end, reference = steady_run(motions[first:last], clip.size, least_overlap)
         runs.append((first + begin, first + end))
         laid[first:last] = motions[first:last] @ np.linalg.inv(motions[first + reference])
-    edges_of = UnseenEdges(len(clip), clip.size)
-    steady = warp_back(clip, laid, runs, out, edges_of)
+    unseen = UnseenEdges(len(clip), clip.size)
+    steady = warp_back(clip, laid, runs, out, unseen)
     if walking is not None and drift > MAY_WALK * max(width, height):
         first, last = max(runs, key=lambda run: run[1] - run[0])
         laid_plainly = GreyFrames(steady.frames, first, last)
         walk, said = walked(GreyFrames(clip.frames, first, last), walking, laid_plainly)
         if walk is not None:
-            _laid_anew(clip, steady, walk, (first, last), edges_of)
-            told = path_of(laid, clip.size), walk.view, walk.fluid_evidence, edges_of.cells
+            _laid_anew(clip, steady, walk, (first, last), unseen)
+            told = path_of(laid, clip.size), walk.view, walk.fluid_evidence, unseen.cells
             return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings), *told)
         warnings += [] if said is None else [said]
     again = [shake_and_drift(motions_of_shots(steady.frames[a:b], (), reach)[0], width, height, ()) for a, b in runs]
@@ -157,7 +157,7 @@ def stabilise(
                 )
             )
         path = path_of(laid, clip.size)
-        return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings), path, unseen=edges_of.cells)
+        return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings), path, unseen=unseen.cells)
     warnings.append(
         Notice(
             "camera-motion-unclear",
@@ -175,6 +175,7 @@ def _laid_anew(
     alpha = None if steady.alpha is None or clip.alpha is None else steady.alpha[part]
     if alpha is not None and clip.alpha is not None:
         alpha[:] = clip.alpha[part]
+    edges.cells[part] = False
     drawn_again(
         clip.frames[part], walk, steady.frames[part], alpha, unseen=lambda t, hidden: edges.put(run[0] + t, hidden)
     )

@@ -420,6 +420,8 @@ def test_edits_are_saved_simulated_in_full_stopped_exported_and_drawn(visit, vie
     visit.press("Export")
     visit.until(lambda: (tmp_path / "out").exists() and not viewer.jobs.running, "the export")
     assert not viewer.jobs.state.failed and any((tmp_path / "out").iterdir())
+    # what moves when the bar goes, a click may miss
+    visit.page.get_by_role("button", name="Stop", exact=True).wait_for(state="hidden")
     visit.unfold("Draw a picture", "Draw")
     visit.press("Draw")
     visit.says("frame 1001 drawn")

@@ -27,12 +27,10 @@ def test_each_frame_is_lent_to_by_one_that_sees_what_it_does_not():
     cells = blind(np.repeat([0, 3], [25, 35]))
     found = donors(cells)
     assert (found[:25] == -1).all(), "they see all"
-    lent = found[25:]
-    assert ((lent >= 0) & (lent < 25)).all()
-    steps = np.diff(lent)
-    assert (steps[steps != 1] < 0).all() and (steps != 1).sum() == 1, (
-        "25 frames in their order, and from the first again"
-    )
+    lenders = found[25:]
+    assert ((lenders >= 0) & (lenders < 25)).all()
+    steps = np.diff(lenders)
+    assert (steps[steps != 1] < 0).all() and (steps != 1).sum() == 1, "in their order, and from the first again"
 
 
 def test_an_edge_that_goes_on_to_grow_is_lent_to_by_what_sees_all_of_it():
@@ -60,9 +58,8 @@ def test_a_cell_is_unseen_where_any_of_its_pixels_is():
 def test_what_is_lent_blends_in_and_leaves_what_was_seen():
     cells = blind(np.repeat([0, 3], [20, 20]))
     lending = list(lent(cells, (128, 96)))
-    assert [t for t, _, _ in lending] == list(range(20, 40)) and [d for _, d, _ in lending] == donors(cells)[
-        20:
-    ].tolist()
+    receivers, lenders = ([pair[k] for pair in lending] for k in range(2))
+    assert receivers == list(range(20, 40)) and lenders == donors(cells)[20:].tolist()
     for _, _, share in lending:
         assert (share[74:] == 1).all() and (share[:56] == 0).all(), "within its cells, and more than a cell beside them"
         across = share[:, 0]

@@ -107,8 +107,10 @@ def test_the_plane_of_the_water_is_level(filmed, walks, path):
 @pytest.mark.parametrize("path", ["forward", "sideways"])
 def test_what_stands_stands_and_what_flows_is_found(filmed, walks, path):
     clip, found = filmed[path], walks[path]
-    laid = np.empty_like(clip.frames)
-    drawn_again(clip.frames, found, laid)
+    laid, unseen = np.empty_like(clip.frames), {}
+    drawn_again(clip.frames, found, laid, unseen=unseen.__setitem__)
+    assert sorted(unseen) == list(range(FRAMES)), "what a turn had left unseen is told anew of all"
+    assert not unseen[found.reference].any() and (unseen[0].any() or unseen[FRAMES - 1].any())
     dry = ~clip.water[found.reference]
     here = clip.frames[found.reference].astype(float)
 
@@ -146,7 +148,6 @@ def test_a_clip_is_steadied_by_its_path(filmed):
     assert report.stabilised and report.view is not None and report.fluid_evidence is not None
     assert report.warnings == () and len(steady) == FRAMES
     assert report.unseen is not None and report.unseen[[0, -1]].any()
-    assert not report.unseen[FRAMES // 2].any(), "what all are laid on sees itself, whichever was it as of a turn"
 
 
 def test_a_camera_that_turns_is_steadied_as_before(filmed):

@@ -229,7 +229,7 @@ def drawn_again(
     """All frames u8 [T,H,W,3] from the place of the reference, written to `out`; alpha [T,H,W] is overwritten.
 
     What a frame does not see is what the frame before it, on the way from the reference, shows there; `unseen` is told
-    where that is.
+    where that is, of every frame.
     """
     count, height, width = frames.shape[:3]
     inverse = walk.inverse_depth((width, height))
@@ -238,12 +238,12 @@ def drawn_again(
         for t in order:
             u, v = walk.maps(t, (width, height), inverse)
             picture = np.ascontiguousarray(frames[t])
+            hidden = (u < -0.5) | (v < -0.5) | (u > width - 0.5) | (v > height - 0.5)
+            if unseen is not None:
+                unseen(t, hidden)
             if t != walk.reference:
                 picture = cv2.remap(picture, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-                hidden = (u < -0.5) | (v < -0.5) | (u > width - 0.5) | (v > height - 0.5)
                 picture[hidden] = out[before][hidden]
-                if unseen is not None:
-                    unseen(t, hidden)
                 if alpha is not None:
                     alpha[t] = cv2.remap(
                         np.ascontiguousarray(alpha[t]), u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE

@@ -175,7 +175,6 @@ def _laid_anew(
     alpha = None if steady.alpha is None or clip.alpha is None else steady.alpha[part]
     if alpha is not None and clip.alpha is not None:
         alpha[:] = clip.alpha[part]
-    edges.cells[part] = False
     drawn_again(
         clip.frames[part], walk, steady.frames[part], alpha, unseen=lambda t, hidden: edges.put(run[0] + t, hidden)
     )
